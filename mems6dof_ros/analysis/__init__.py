@@ -1,0 +1,1 @@
+"""Offline work on whole recordings: analyze, compare with truth, report."""

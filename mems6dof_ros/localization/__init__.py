@@ -1,0 +1,1 @@
+"""From a frame to localizations: camera, detection, image fits, three-dimensional positions."""

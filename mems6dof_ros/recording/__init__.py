@@ -1,0 +1,1 @@
+"""Records: MCAP bags, message schemas, tables."""

@@ -1,0 +1,1 @@
+"""The physical simulator: optics, microsystem, camera, and the truth beside every frame."""

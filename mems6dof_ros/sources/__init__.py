@@ -1,0 +1,1 @@
+"""Where frames come from: one small protocol, sources chosen by name."""

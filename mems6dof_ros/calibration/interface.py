@@ -1,0 +1,45 @@
+"""What the localizer needs of a calibration, whatever its method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mems6dof_ros.localization.localizations import GaussianFits
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Three-dimensional positions of n fitted particles.
+
+    ``position`` (n, 3) m in the microscope frame, ``covariance`` (n, 3, 3) m^2, ``z_gap`` (n,)
+    chi-square by which the second-best z is worse (NaN without a second candidate), ``flags`` (n,)
+    of Flag to add to those of the fits.
+    """
+
+    position: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    z_gap: NDArray[np.float64]
+    flags: NDArray[np.uint32]
+
+
+class OpticalCalibration(Protocol):
+    """A calibration of the optics: fitted shapes to positions, within a stated range.
+
+    ``calibration_id`` identifies the content (hash); ``pixel_size`` m; ``image_size`` (width,
+    height) px; ``weighting`` and ``window_px``: the fit it was made with and must be used with.
+    """
+
+    calibration_id: str
+    method: str
+    pixel_size: float
+    image_size: tuple[int, int]
+    weighting: str
+    window_px: int
+
+    def locate(self, fits: GaussianFits) -> Positions:
+        """Positions of ``fits``; failed fits give NaN, values beyond the range are flagged."""
+        ...

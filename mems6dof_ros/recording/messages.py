@@ -58,7 +58,7 @@ def to_rclpy(message: Message) -> Any:
         elif isinstance(sequence := getattr(result, field), array.array):
             # The only assignment that rclpy does not check element by element (seconds per frame).
             sequence = array.array(sequence.typecode)
-            sequence.frombytes(np.ascontiguousarray(value, dtype=sequence.typecode).data)
+            sequence.frombytes(np.ascontiguousarray(value, dtype=sequence.typecode).view(np.uint8).data)
             value = sequence
         setattr(result, field, value)
     return result

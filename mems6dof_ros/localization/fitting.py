@@ -1,0 +1,81 @@
+"""Bivariate-Gaussian fits to the particles of one image: the public face of the kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import check_image
+from mems6dof_ros.localization import kernels
+from mems6dof_ros.localization.camera import CameraNoise
+from mems6dof_ros.localization.localizations import Flag, GaussianFits
+
+#: The weightings by name. ``docs/localization.md`` defines and compares them.
+WEIGHTINGS = {
+    "light_weighting": kernels.LIGHT,
+    "light_weighting_relative": kernels.LIGHT_RELATIVE,
+    "uniform": kernels.UNIFORM,
+    "poisson": kernels.POISSON,
+}
+
+#: Variance floor of the relative light-weighting, in units of the amplitude.
+KAPPA = 0.1
+
+SMALLEST_WINDOW_PX, LARGEST_WINDOW_PX = 7, 65
+
+
+def fit_gaussians(
+    image: NDArray[np.generic],
+    positions_px: ArrayLike,
+    camera: CameraNoise,
+    weighting: str = "light_weighting",
+    window_px: int = 31,
+    kappa: float = KAPPA,
+    start: GaussianFits | None = None,
+) -> GaussianFits:
+    """Fit one Gaussian to the window about each position.
+
+    ``image`` (height, width) uint8 or uint16, ADU; ``positions_px`` (n, 2), column and row, good to
+    about a particle's radius; ``weighting`` one of WEIGHTINGS; ``window_px`` odd side of the window;
+    ``kappa`` variance floor over amplitude of ``light_weighting_relative``. ``start``: earlier fits of
+    the same particles, n of them, whose shapes start the new fits at ``positions_px``, which then must
+    be good to a pixel.
+
+    Flags set: FIT_FAILED (not converged, or no particle in the window), WINDOW_CUT (more than a seventh
+    of the window outside the image), SATURATED. Raises InputError for an image, position, weighting or
+    window that cannot be used.
+    """
+    check_image(image, "image")
+    camera.check_shape(image.shape)
+    positions = np.asarray(positions_px, dtype=np.float64).reshape(-1, 2)
+    if weighting not in WEIGHTINGS:
+        raise InputError("weighting", repr(weighting), f"one of {', '.join(WEIGHTINGS)}")
+    if not (SMALLEST_WINDOW_PX <= window_px <= LARGEST_WINDOW_PX and window_px % 2 == 1):
+        raise InputError("window_px", f"{window_px}", f"an odd {SMALLEST_WINDOW_PX} to {LARGEST_WINDOW_PX}")
+    if not 0 < kappa < 10:
+        raise InputError("kappa", f"{kappa}", "a positive number, about 0.1")
+    starts = positions
+    if start is not None:
+        if len(start) != len(positions):
+            raise InputError("start", f"{len(start)} fits", f"as many as positions, {len(positions)}")
+        starts = np.hstack([positions, start.parameters[:, 2:]])
+    n = len(positions)
+    parameters, covariance, quality = np.empty((n, 7)), np.empty((n, 7, 7)), np.empty((n, 4))
+    kernels.fit_windows(
+        np.ascontiguousarray(image),
+        starts,
+        *camera.maps,
+        float(camera.saturation_adu),
+        window_px,
+        WEIGHTINGS[weighting],
+        float(kappa),
+        parameters,
+        covariance,
+        quality,
+    )
+    flags = np.zeros(n, dtype=np.uint32)
+    flags[np.isnan(parameters[:, 0])] |= np.uint32(Flag.FIT_FAILED)
+    flags[quality[:, 2] * 7 > window_px] |= np.uint32(Flag.WINDOW_CUT)
+    flags[quality[:, 3] > 0] |= np.uint32(Flag.SATURATED)
+    return GaussianFits(parameters, covariance, quality[:, 0], quality[:, 1].astype(np.int32), flags)

@@ -1,0 +1,595 @@
+"""Compiled kernels of the Gaussian fit: numbers in, numbers out, nothing else of the project inside.
+
+All kernels release the GIL (threads over frames) and are cached on disk. Arrays of the kernels:
+
+=============  ==================  =====================================================================
+name           shape, type         content
+=============  ==================  =====================================================================
+image          (h, w) u1 or u2     pixels, ADU
+starts         (n, 2) or (n, 7)    particles: px of the image, or whole parameters of an earlier fit
+offset         (h, w) or (1, 1)    ADU
+gain           (h, w) or (1, 1)    ADU per electron
+read_variance  (h, w) or (1, 1)    electrons^2
+saturation     number              ADU
+window         odd number          side of the window, px
+weighting      number              UNIFORM, LIGHT, LIGHT_RELATIVE, POISSON
+kappa          number              LIGHT_RELATIVE only: variance floor over amplitude
+parameters     (n, 7)              out: x, y, A, sigma_x, sigma_y, rho, B of the image; px, electrons
+covariance     (n, 7, 7)           out
+quality        (n, 4)              out: reduced chi-square, iterations, lines cut off, saturated pixels
+=============  ==================  =====================================================================
+
+Inside, a window is flat, each row padded to a multiple of LANES so that every loop runs in whole
+vectors; padding has weight 0. The parameters are iterated as ``theta = (x, y, A, ln sigma_x,
+ln sigma_y, atanh rho, B)`` relative to the window's central pixel, which keeps widths positive and
+``|rho| < 1`` without constraints.
+
+Where the speed comes from. The exponent is quadratic, so that E of the next row is E times a ratio
+which itself changes by a constant factor: two products per pixel instead of an exponential. Every
+derivative is E times a quadratic polynomial (or 1 for the background): J'WJ and J'Wr follow from 22 + 7
+weighted moments and a 7 x 7 transformation per window.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+UNIFORM, LIGHT, LIGHT_RELATIVE, POISSON = 0, 1, 2, 3
+
+LANES = 8
+VARIANCE_FLOOR = 0.01  # electrons^2, as in gaussian.py
+LEAST_SIGMA = 0.7  # px; with LARGEST_ATANH and windows to 65 px no exponential overflows
+LARGEST_ATANH = 1.8  # rho = 0.947
+MAX_ITERATIONS = 60
+START_ITERATIONS = 4  # uniform steps at most before the weighted fit
+TOLERANCE = 1e-5  # expected decrease of chi-square at which to stop, in units of chi-square per pixel
+
+# Sums may be reordered (vectors), divisions stay exact enough, NaN and infinity keep their meaning.
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _shape(theta, window, stride, shape):
+    """Fill ``shape`` with E, the Gaussian of unit amplitude, outwards from the central pixel."""
+    half = window // 2
+    x, y = theta[0], theta[1]
+    rho = math.tanh(theta[5])
+    k = 1 / (1 - rho * rho)
+    sx, sy = math.exp(theta[3]), math.exp(theta[4])
+    a, b, c = k / (sx * sx), -k * rho / (sx * sy), k / (sy * sy)
+    # Central row: chains to the right and to the left.
+    centre = half * stride
+    start = math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y))
+    twist = math.exp(b * x)  # exp(-b u) at the central column
+    tilt = math.exp(b * y)
+    turn, curve = math.exp(-b), math.exp(-a)
+    step = np.empty(stride)
+    e, ratio, t = start, math.exp(a * x - 0.5 * a) * tilt, twist
+    for j in range(half, stride):
+        shape[centre + j], step[j] = e, t
+        e *= ratio
+        ratio *= curve
+        t *= turn
+    e, ratio, t = start, math.exp(-a * x - 0.5 * a) / tilt, twist
+    for j in range(half, -1, -1):
+        shape[centre + j], step[j] = e, t
+        e *= ratio
+        ratio *= curve
+        t /= turn
+    # From row to row: the ratio of neighbours changes by one constant factor.
+    curve = math.exp(-c)
+    ratios = np.empty(stride)
+    down = math.exp(c * y - 0.5 * c)
+    for j in range(stride):
+        ratios[j] = down * step[j]
+    for i in range(half + 1, window):
+        k0 = i * stride
+        for j in range(stride):
+            shape[k0 + j] = shape[k0 - stride + j] * ratios[j]
+            ratios[j] *= curve
+    up = math.exp(-c * y - 0.5 * c)
+    for j in range(stride):
+        ratios[j] = up / step[j]
+    for i in range(half - 1, -1, -1):
+        k0 = i * stride
+        for j in range(stride):
+            shape[k0 + j] = shape[k0 + stride + j] * ratios[j]
+            ratios[j] *= curve
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _weigh(theta, data, noise, valid, shape, weighting, weights, pulls):
+    """Second and first derivatives of the objective's half by the model: ``weights``, ``pulls``.
+
+    Returns the objective. Light-weighting differentiates the variance too where the model is the
+    greater: with it frozen, steps and acceptance test disagree and fits do not converge.
+    """
+    amplitude, background = theta[2], theta[6]
+    total = 0.0
+    if weighting == UNIFORM:
+        for k in range(data.size):
+            r = data[k] - (amplitude * shape[k] + background)
+            weights[k] = valid[k]
+            pulls[k] = valid[k] * r
+            total += valid[k] * r * r
+    elif weighting == POISSON:
+        for k in range(data.size):
+            if valid[k] > 0:
+                mean = max(amplitude * shape[k] + background + noise[k], VARIANCE_FLOOR)
+                count = max(data[k] + noise[k], VARIANCE_FLOOR)
+                weights[k] = 1 / mean
+                pulls[k] = count / mean - 1
+                total += 2 * (mean - count - count * math.log(mean / count))
+            else:
+                weights[k] = 0.0
+                pulls[k] = 0.0
+    else:
+        for k in range(data.size):
+            model = amplitude * shape[k] + background
+            r = data[k] - model
+            greater = data[k] if r > 0 else model
+            variance = greater + noise[k]
+            variance = variance if variance > VARIANCE_FLOOR else VARIANCE_FLOOR
+            inverse = valid[k] / variance
+            chi = r * inverse
+            renewed = 1.0 if r > 0 else 1 + 0.5 * chi
+            weights[k] = inverse * renewed * renewed
+            pulls[k] = chi * renewed
+            total += r * chi
+    return total
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _moments(shape, u, v, weights, moments):
+    """The 7 x 7 weighted products of (E, E u, E v, E u^2, E u v, E v^2, 1) from their 22 moments."""
+    s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = 0.0
+    s40 = s31 = s22 = s13 = s04 = 0.0
+    for k in range(shape.size):
+        f = weights[k] * shape[k] * shape[k]
+        fu, fv = f * u[k], f * v[k]
+        uu, uv, vv = u[k] * u[k], u[k] * v[k], v[k] * v[k]
+        fuu, fuv, fvv = f * uu, f * uv, f * vv
+        s00 += f
+        s10 += fu
+        s01 += fv
+        s20 += fuu
+        s11 += fuv
+        s02 += fvv
+        s30 += fu * uu
+        s21 += fu * uv
+        s12 += fv * uv
+        s03 += fv * vv
+        s40 += fuu * uu
+        s31 += fuu * uv
+        s22 += fuu * vv
+        s13 += fuv * vv
+        s04 += fvv * vv
+    t00 = t10 = t01 = t20 = t11 = t02 = w = 0.0
+    for k in range(shape.size):
+        f = weights[k] * shape[k]
+        fu, fv = f * u[k], f * v[k]
+        t00 += f
+        t10 += fu
+        t01 += fv
+        t20 += fu * u[k]
+        t11 += fu * v[k]
+        t02 += fv * v[k]
+        w += weights[k]
+    moments[0] = (s00, s10, s01, s20, s11, s02, t00)
+    moments[1] = (s10, s20, s11, s30, s21, s12, t10)
+    moments[2] = (s01, s11, s02, s21, s12, s03, t01)
+    moments[3] = (s20, s30, s21, s40, s31, s22, t20)
+    moments[4] = (s11, s21, s12, s31, s22, s13, t11)
+    moments[5] = (s02, s12, s03, s22, s13, s04, t02)
+    moments[6] = (t00, t10, t01, t20, t11, t02, w)
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _gradient(shape, u, v, pulls, gradient):
+    """The seven products of the same functions with ``pulls``."""
+    t00 = t10 = t01 = t20 = t11 = t02 = w = 0.0
+    for k in range(shape.size):
+        f = pulls[k] * shape[k]
+        fu, fv = f * u[k], f * v[k]
+        t00 += f
+        t10 += fu
+        t01 += fv
+        t20 += fu * u[k]
+        t11 += fu * v[k]
+        t02 += fv * v[k]
+        w += pulls[k]
+    gradient[0], gradient[1], gradient[2] = t00, t10, t01
+    gradient[3], gradient[4], gradient[5], gradient[6] = t20, t11, t02, w
+
+
+@njit(**_OPTIONS)
+def _transformation(theta, t):
+    """Columns of ``t`` (7, 7): the derivative by each theta in the functions of ``_moments``."""
+    x, y, amplitude = theta[0], theta[1], theta[2]
+    rho = math.tanh(theta[5])
+    k = 1 / (1 - rho * rho)
+    sx, sy = math.exp(theta[3]), math.exp(theta[4])
+    a, b, c = k / (sx * sx), -k * rho / (sx * sy), k / (sy * sy)
+    t[:] = 0.0
+    t[0, 0], t[1, 0], t[2, 0] = -amplitude * (a * x + b * y), amplitude * a, amplitude * b
+    t[0, 1], t[1, 1], t[2, 1] = -amplitude * (b * x + c * y), amplitude * b, amplitude * c
+    t[0, 2] = 1.0
+    for column, p, q, r in (
+        (3, a, b, 0.0),
+        (4, 0.0, b, c),
+        (5, -rho * a, (1 + rho * rho) * k / (sx * sy), -rho * c),
+    ):
+        # p (u - x)^2 + q (u - x)(v - y) + r (v - y)^2
+        t[0, column] = amplitude * (p * x * x + q * x * y + r * y * y)
+        t[1, column] = -amplitude * (2 * p * x + q * y)
+        t[2, column] = -amplitude * (2 * r * y + q * x)
+        t[3, column], t[4, column], t[5, column] = amplitude * p, amplitude * q, amplitude * r
+    t[6, 6] = 1.0
+
+
+@njit(**_OPTIONS)
+def _normal(t, moments, normal):
+    """``normal = t' moments t`` (7, 7)."""
+    half = np.empty((7, 7))
+    for i in range(7):
+        for j in range(7):
+            s = 0.0
+            for m in range(7):
+                s += moments[i, m] * t[m, j]
+            half[i, j] = s
+    for i in range(7):
+        for j in range(i + 1):
+            s = 0.0
+            for m in range(7):
+                s += t[m, i] * half[m, j]
+            normal[i, j] = s
+            normal[j, i] = s
+
+
+@njit(**_OPTIONS)
+def _factorise(matrix, damping, factor):
+    """Cholesky factor of the matrix with its diagonal raised by ``damping``; False where singular."""
+    for i in range(7):
+        for j in range(i + 1):
+            s = matrix[i, j]
+            if i == j:
+                s *= 1 + damping
+            for m in range(j):
+                s -= factor[i, m] * factor[j, m]
+            if i == j:
+                if not s > 1e-13 * matrix[i, i]:
+                    return False
+                factor[i, i] = math.sqrt(s)
+            else:
+                factor[i, j] = s / factor[j, j]
+    return True
+
+
+@njit(**_OPTIONS)
+def _solve(factor, right, solution):
+    for i in range(7):
+        s = right[i]
+        for m in range(i):
+            s -= factor[i, m] * solution[m]
+        solution[i] = s / factor[i, i]
+    for i in range(6, -1, -1):
+        s = solution[i]
+        for m in range(i + 1, 7):
+            s -= factor[m, i] * solution[m]
+        solution[i] = s / factor[i, i]
+
+
+@njit(**_OPTIONS)
+def _read_window(image, column, row, offset, gain, read_variance, window, stride, data, read, valid):
+    """Electrons of the window about a pixel; what lies outside the image is not valid.
+
+    Returns the lines cut off at the worst edge and the largest pixel, ADU.
+    """
+    height, width = image.shape
+    half = window // 2
+    valid[:] = 0.0
+    data[:] = 0.0
+    read[:] = 1.0
+    top, bottom = max(row - half, 0), min(row + half, height - 1)
+    left, right = max(column - half, 0), min(column + half, width - 1)
+    largest = 0
+    for i in range(top, bottom + 1):
+        k = (i - row + half) * stride - column + half
+        for j in range(left, right + 1):
+            adu = image[i, j]
+            largest = max(largest, adu)
+            o = offset[i, j] if offset.size > 1 else offset[0, 0]
+            g = gain[i, j] if gain.size > 1 else gain[0, 0]
+            data[k + j] = (adu - o) / g
+            read[k + j] = read_variance[i, j] if read_variance.size > 1 else read_variance[0, 0]
+            valid[k + j] = 1.0
+    cut = max(max(half - column, half - row), max(column + half - width + 1, row + half - height + 1))
+    return max(cut, 0), largest
+
+
+@njit(**_OPTIONS)
+def _start(data, valid, window, stride, theta):
+    """First parameters from the window alone: border, peak, and moments above 30 % of it.
+
+    A Gaussian cut at the fraction f of its height and lowered by it has 0.358 of its variance
+    (f = 0.3): [1 - f (1 + L) - f L^2 / 2] / [1 - f - f L], L = -ln f.
+    """
+    half = window // 2
+    background, count = 0.0, 0
+    for i in range(window):
+        for j in range(window):
+            k = i * stride + j
+            if (i == 0 or j == 0 or i == window - 1 or j == window - 1) and valid[k] > 0:
+                background += data[k]
+                count += 1
+    if count == 0:
+        return False
+    background /= count
+    # The peak lies in the inner half, as a mean of nine pixels against noise.
+    peak = -np.inf
+    for i in range(half // 2, window - half // 2):
+        for j in range(half // 2, window - half // 2):
+            k = i * stride + j
+            if valid[k] > 0:
+                s, n = 0.0, 0.0
+                for m in (-stride, 0, stride):
+                    s += valid[k + m - 1] * data[k + m - 1] + valid[k + m] * data[k + m]
+                    s += valid[k + m + 1] * data[k + m + 1]
+                    n += valid[k + m - 1] + valid[k + m] + valid[k + m + 1]
+                peak = max(peak, s / n)
+    level = background + 0.3 * (peak - background)
+    m0 = mx = my = mxx = mxy = myy = 0.0
+    for i in range(window):
+        for j in range(window):
+            k = i * stride + j
+            f = (data[k] - level) * valid[k]
+            if f > 0:
+                m0 += f
+                mx += f * (j - half)
+                my += f * (i - half)
+                mxx += f * (j - half) * (j - half)
+                mxy += f * (j - half) * (i - half)
+                myy += f * (i - half) * (i - half)
+    if not m0 > 0:
+        return False
+    x, y = mx / m0, my / m0
+    vx = max((mxx / m0 - x * x) / 0.358, 1.0)
+    vy = max((myy / m0 - y * y) / 0.358, 1.0)
+    rho = (mxy / m0 - x * y) / 0.358 / math.sqrt(vx * vy)
+    theta[0], theta[1], theta[2] = x, y, peak - background
+    theta[3], theta[4] = 0.5 * math.log(vx), 0.5 * math.log(vy)
+    theta[5] = math.atanh(min(max(rho, -0.7), 0.7))
+    theta[6] = background
+    return True
+
+
+@njit(**_OPTIONS)
+def _bounded_step(theta, step, window, trial):
+    """``trial = theta + step``, the step shortened where a width or a position would leap."""
+    longest = max(
+        max(abs(step[0]), abs(step[1])) / 3, max(max(abs(step[3]), abs(step[4])), abs(step[5])) / 0.5
+    )
+    scale = 1 / longest if longest > 1 else 1.0
+    for i in range(7):
+        trial[i] = theta[i] + scale * step[i]
+    low, high = math.log(LEAST_SIGMA), math.log(2.0 * window)
+    trial[3] = min(max(trial[3], low), high)
+    trial[4] = min(max(trial[4], low), high)
+    trial[5] = min(max(trial[5], -LARGEST_ATANH), LARGEST_ATANH)
+    return scale == 1.0
+
+
+@njit(**_OPTIONS)
+def _inside(theta, window):
+    """Whether the parameters describe a particle in the window, and no bound has been hit."""
+    half = window // 2
+    low, high = math.log(LEAST_SIGMA), math.log(2.0 * window)
+    return (
+        abs(theta[0]) <= half
+        and abs(theta[1]) <= half
+        and theta[2] > 0
+        and low < theta[3] < high
+        and low < theta[4] < high
+        and abs(theta[5]) < LARGEST_ATANH
+        and theta[6] < np.inf
+    )
+
+
+@njit(**_OPTIONS)
+def _minimise(theta, data, noise, valid, u, v, window, stride, weighting, most, tolerance, work):
+    """Levenberg-Marquardt from ``theta`` in place. Returns the iterations; negative: no convergence."""
+    shape, weights, pulls = work[0], work[1], work[2]
+    moments, t, normal, factor = np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7))
+    raw, gradient, step, trial = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
+    pixels = max(valid.sum(), 8.0)
+    damping = 0.0
+    _shape(theta, window, stride, shape)
+    objective = _weigh(theta, data, noise, valid, shape, weighting, weights, pulls)
+    renew = True
+    for iteration in range(1, most + 1):
+        if renew:
+            _moments(shape, u, v, weights, moments)
+            _gradient(shape, u, v, pulls, raw)
+            _transformation(theta, t)
+            _normal(t, moments, normal)
+            for i in range(7):
+                s = 0.0
+                for m in range(7):
+                    s += t[m, i] * raw[m]
+                gradient[i] = s
+        while not _factorise(normal, damping, factor):
+            damping = max(10 * damping, 1e-3)
+            if not damping < 1e9:
+                return -iteration
+        _solve(factor, gradient, step)
+        expected = 0.0
+        for i in range(7):
+            expected += gradient[i] * step[i]
+        whole = _bounded_step(theta, step, window, trial)
+        if whole and damping < 1e-2 and expected <= tolerance * objective / pixels:
+            theta[:] = trial
+            return iteration
+        _shape(trial, window, stride, shape)
+        found = _weigh(trial, data, noise, valid, shape, weighting, weights, pulls)
+        renew = found <= objective
+        if renew:
+            theta[:] = trial
+            objective = found
+            damping = 0.1 * damping if damping > 1e-6 else 0.0
+        else:
+            damping = max(10 * damping, 1e-3)
+            if damping > 1e9:
+                return -iteration
+    return -most
+
+
+@njit(**_OPTIONS)
+def _uncertainty(theta, data, read, noise, valid, u, v, window, stride, weighting, work, covariance):
+    """Covariance of x, y, A, sigma_x, sigma_y, rho, B at the solution; returns reduced chi-square.
+
+    Pixel variance V = model + read noise. Where the weights are 1/V (light-weighting, Poisson) the
+    inverse normal matrix; otherwise the sandwich N^-1 (J'W V W J) N^-1 of weighted least squares.
+    Chi-square is Pearson's, with V, whatever the weighting: 1 for a matched model.
+    """
+    shape, weights, meat = work[0], work[1], work[2]
+    _shape(theta, window, stride, shape)
+    chi, pixels = 0.0, 0.0
+    for k in range(data.size):
+        model = theta[2] * shape[k] + theta[6]
+        variance = max(model + read[k], VARIANCE_FLOOR)
+        r = data[k] - model
+        chi += valid[k] * r * r / variance
+        pixels += valid[k]
+        if weighting == UNIFORM:
+            weights[k] = valid[k]
+        elif weighting == LIGHT_RELATIVE:
+            weights[k] = valid[k] / max(model + noise[k], VARIANCE_FLOOR)
+        else:
+            weights[k] = valid[k] / variance
+        meat[k] = weights[k] * weights[k] * variance
+    moments, t = np.empty((7, 7)), np.empty((7, 7))
+    normal, factor, middle = np.empty((7, 7)), np.zeros((7, 7)), np.empty((7, 7))
+    _transformation(theta, t)
+    _moments(shape, u, v, weights, moments)
+    _normal(t, moments, normal)
+    if not _factorise(normal, 0.0, factor):
+        return np.nan
+    inverse, unit, column = np.empty((7, 7)), np.zeros(7), np.empty(7)
+    for i in range(7):
+        unit[:] = 0.0
+        unit[i] = 1.0
+        _solve(factor, unit, column)
+        inverse[i] = column
+    if weighting == UNIFORM or weighting == LIGHT_RELATIVE:
+        _moments(shape, u, v, meat, moments)
+        _normal(t, moments, middle)
+        _normal(inverse, middle, covariance)
+    else:
+        covariance[:] = inverse
+    rho = math.tanh(theta[5])
+    scale = (1.0, 1.0, 1.0, math.exp(theta[3]), math.exp(theta[4]), 1 - rho * rho, 1.0)
+    for i in range(7):
+        for j in range(7):
+            covariance[i, j] *= scale[i] * scale[j]
+    return chi / max(pixels - 7, 1.0)
+
+
+@njit(**_OPTIONS)
+def fit_windows(
+    image,
+    starts,
+    offset,
+    gain,
+    read_variance,
+    saturation,
+    window,
+    weighting,
+    kappa,
+    parameters,
+    covariance,
+    quality,
+):
+    """Fit one Gaussian to the window about each start; NaN parameters where a fit fails.
+
+    The window follows the particle: it is moved until its central pixel is the fitted one, so that
+    the result does not depend on where the detection put it.
+    """
+    half = window // 2
+    stride = (window + LANES - 1) // LANES * LANES
+    size = window * stride
+    data, read, noise, valid = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    u, v = np.empty(size), np.empty(size)
+    work = np.empty((3, size))
+    for k in range(size):
+        u[k] = k % stride - half
+        v[k] = k // stride - half
+    theta = np.empty(7)
+    height, width = image.shape
+    for n in range(len(starts)):
+        parameters[n] = np.nan
+        covariance[n] = np.nan
+        quality[n] = (np.nan, 0.0, 0.0, 0.0)
+        if not (-0.5 <= starts[n, 0] < width - 0.5 and -0.5 <= starts[n, 1] < height - 0.5):
+            continue
+        column, row = int(round(starts[n, 0])), int(round(starts[n, 1]))
+        known = starts.shape[1] == 7
+        iterations = 0
+        for attempt in range(4):
+            cut, largest = _read_window(
+                image, column, row, offset, gain, read_variance, window, stride, data, read, valid
+            )
+            if attempt == 0:
+                if known:
+                    theta[:] = starts[n]
+                    theta[0] -= column
+                    theta[1] -= row
+                    theta[3], theta[4] = math.log(theta[3]), math.log(theta[4])
+                    theta[5] = math.atanh(theta[5])
+                elif not _start(data, valid, window, stride, theta):
+                    iterations = -1
+                    break
+            if weighting != UNIFORM and (attempt > 0 or not known or weighting == LIGHT_RELATIVE):
+                # A rough uniform fit: robust start of every weighting, amplitude scale of the relative one.
+                iterations += abs(
+                    _minimise(
+                        theta, data, read, valid, u, v, window, stride, UNIFORM, START_ITERATIONS, 1e-2, work
+                    )
+                )
+            if weighting == LIGHT_RELATIVE:
+                noise[:] = kappa * theta[2] - theta[6]
+            else:
+                noise[:] = read
+            done = _minimise(
+                theta, data, noise, valid, u, v, window, stride, weighting, MAX_ITERATIONS, TOLERANCE, work
+            )
+            iterations += abs(done)
+            if done < 0 or not _inside(theta, window):
+                iterations = -iterations
+                break
+            if max(abs(theta[0]), abs(theta[1])) <= 0.75:
+                break
+            move_x, move_y = int(round(theta[0])), int(round(theta[1]))
+            if not (0 <= column + move_x < width and 0 <= row + move_y < height):
+                break
+            column, row = column + move_x, row + move_y
+            theta[0] -= move_x
+            theta[1] -= move_y
+        quality[n, 1] = abs(iterations)
+        if iterations <= 0:
+            continue
+        quality[n, 2] = cut
+        quality[n, 3] = 1.0 if largest >= saturation else 0.0
+        quality[n, 0] = _uncertainty(
+            theta, data, read, noise, valid, u, v, window, stride, weighting, work, covariance[n]
+        )
+        if math.isnan(quality[n, 0]):
+            covariance[n] = np.nan
+            continue
+        parameters[n, 0], parameters[n, 1] = column + theta[0], row + theta[1]
+        parameters[n, 2], parameters[n, 6] = theta[2], theta[6]
+        parameters[n, 3], parameters[n, 4] = math.exp(theta[3]), math.exp(theta[4])
+        parameters[n, 5] = math.tanh(theta[5])

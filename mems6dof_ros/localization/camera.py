@@ -33,7 +33,7 @@ class CameraNoise:
         if len(shapes) > 1:
             raise InputError("camera", f"maps of shapes {sorted(shapes)}", "one shape")
         if np.min(self.gain_adu_per_electron) <= 0:
-            raise InputError("camera.gain_adu_per_electron", "a value of 0 or less", "positive ADU per electron")
+            raise InputError("camera.gain_adu_per_electron", "0 or less", "positive ADU per electron")
         if np.min(self.read_noise_electrons) < 0:
             raise InputError("camera.read_noise_electrons", "a negative value", "0 or more electrons")
         if not 0 < self.saturation_adu < float("inf"):

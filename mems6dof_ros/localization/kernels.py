@@ -484,7 +484,7 @@ def _uncertainty(theta, data, read, noise, valid, u, v, window, stride, weightin
         unit[i] = 1.0
         _solve(factor, unit, column)
         inverse[i] = column
-    if weighting == UNIFORM or weighting == LIGHT_RELATIVE:
+    if weighting in (UNIFORM, LIGHT_RELATIVE):
         _moments(shape, u, v, meat, moments)
         _normal(t, moments, middle)
         _normal(inverse, middle, covariance)
@@ -535,7 +535,7 @@ def fit_windows(
         quality[n] = (np.nan, 0.0, 0.0, 0.0)
         if not (-0.5 <= starts[n, 0] < width - 0.5 and -0.5 <= starts[n, 1] < height - 0.5):
             continue
-        column, row = int(round(starts[n, 0])), int(round(starts[n, 1]))
+        column, row = round(starts[n, 0]), round(starts[n, 1])
         known = starts.shape[1] == 7
         iterations = 0
         for attempt in range(4):
@@ -572,7 +572,7 @@ def fit_windows(
                 break
             if max(abs(theta[0]), abs(theta[1])) <= 0.75:
                 break
-            move_x, move_y = int(round(theta[0])), int(round(theta[1]))
+            move_x, move_y = round(theta[0]), round(theta[1])
             if not (0 <= column + move_x < width and 0 <= row + move_y < height):
                 break
             column, row = column + move_x, row + move_y

@@ -1,0 +1,139 @@
+"""Where the particles are, to about a pixel: the start of the fits.
+
+On a binned image, against a local background, by differences of Gaussians at two sizes: the smaller
+finds particles in focus, the larger what defocus has spread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import check_image
+
+#: Median absolute deviation to standard deviation of a normal distribution.
+_MAD_TO_SD = 1.4826
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """How particles are found.
+
+    ``binning`` px to a side of one cell that detection works on. ``spot_sigmas_px``: sizes of spots to
+    look for, standard deviations in px. ``threshold``: least contrast of a spot in standard deviations of
+    the filtered background. ``separation_px``: of two candidates closer than this only the brighter stays.
+    ``background_px``: size over which the background may vary, several times that of a spot.
+    """
+
+    binning: int = 4
+    spot_sigmas_px: tuple[float, ...] = (5.0, 11.0)
+    threshold: float = 8.0
+    separation_px: float = 16.0
+    background_px: int = 160
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.binning <= 16:
+            raise InputError("detection.binning", f"{self.binning}", "1 to 16 px")
+        if not self.spot_sigmas_px or not all(0.5 <= s <= 100 for s in self.spot_sigmas_px):
+            raise InputError("detection.spot_sigmas_px", f"{self.spot_sigmas_px}", "sizes of 0.5 to 100 px")
+        if not 3 <= self.threshold < float("inf"):
+            raise InputError("detection.threshold", f"{self.threshold}", "3 or more standard deviations")
+        if not 1 <= self.separation_px < float("inf"):
+            raise InputError("detection.separation_px", f"{self.separation_px}", "1 px or more")
+        if not self.background_px >= 10 * self.binning:
+            raise InputError("detection.background_px", f"{self.background_px}", "10 cells or more")
+
+
+def detect(image: NDArray[np.generic], settings: DetectionSettings | None = None) -> NDArray[np.float64]:
+    """Candidates (n, 2), column and row in px, brightest contrast first.
+
+    ``image`` (height, width) uint8 or uint16. Offset and gain of the camera do not matter: contrast is
+    measured against the noise of the image itself. An image without contrast has no particles. Raises
+    InputError for an image that is none.
+    """
+    check_image(image, "image")
+    settings = settings or DetectionSettings()
+    cells = _bin(image, settings.binning)
+    if min(cells.shape) < 3:
+        return np.empty((0, 2))
+    score = _score(cells, settings)
+    highest = cv2.dilate(score, np.ones((3, 3), np.uint8))
+    rows, columns = np.nonzero((score == highest) & (score > settings.threshold))
+    order = np.argsort(-score[rows, columns], kind="stable")
+    rows, columns = rows[order], columns[order]
+    positions = np.stack(
+        [columns + _vertex(score, rows, columns, 0, 1), rows + _vertex(score, rows, columns, 1, 0)], axis=1
+    )
+    positions = (positions + 0.5) * settings.binning - 0.5
+    return positions[_separated(positions, settings.separation_px)]
+
+
+def _bin(image: NDArray[np.generic], binning: int) -> NDArray[np.float32]:
+    """Means over cells of ``binning`` px; lines that do not fill a cell are left out."""
+    height, width = (n // binning for n in image.shape)
+    if height == 0 or width == 0:
+        return np.empty((0, 0), np.float32)
+    whole = image[: height * binning, : width * binning]
+    if binning == 1:
+        return whole.astype(np.float32)
+    # The mean of 8-bit pixels would be rounded to 8 bit.
+    whole = whole if whole.dtype == np.uint16 else whole.astype(np.uint16) << 8
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def _score(cells: NDArray[np.float32], settings: DetectionSettings) -> NDArray[np.float32]:
+    """Contrast of spots in standard deviations of the background, the best of all sizes."""
+    flat = cells - _background(cells, settings.background_px // settings.binning)
+    # Dark debris is cut off at the depth of noise: filtered, its rim would look like bright spots.
+    np.maximum(flat, -2 * _deviation(flat), out=flat)
+    best = np.zeros_like(flat)
+    for sigma in settings.spot_sigmas_px:
+        narrow = max(sigma / settings.binning, 0.5)
+        response = _blur(flat, narrow) - _blur(flat, 2 * narrow)
+        # The floor, far below one count, keeps rounding from becoming contrast in images without noise.
+        np.maximum(best, response / max(_deviation(response), 0.01), out=best)
+    return best
+
+
+def _background(cells: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Median over about ``size`` cells, from means over a fifth of it."""
+    height, width = cells.shape
+    coarse = (max(round(5 * width / size), 1), max(round(5 * height / size), 1))
+    means = cv2.resize(cells, coarse, interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.medianBlur(means, 5), (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _blur(cells: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    size = 2 * int(np.ceil(2.5 * sigma)) + 1
+    return cv2.GaussianBlur(cells, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+
+
+def _deviation(cells: NDArray[np.float32]) -> float:
+    """Robust standard deviation, from a sixteenth of the cells."""
+    sample = cells[::4, ::4]
+    return _MAD_TO_SD * float(np.median(np.abs(sample - np.median(sample))))
+
+
+def _vertex(score: NDArray[np.float32], rows: NDArray, columns: NDArray, down: int, right: int) -> NDArray:
+    """Offset, within half a cell, of the parabola's vertex through a maximum and its two neighbours."""
+    height, width = score.shape
+    before = score[np.maximum(rows - down, 0), np.maximum(columns - right, 0)]
+    after = score[np.minimum(rows + down, height - 1), np.minimum(columns + right, width - 1)]
+    curvature = 2 * score[rows, columns] - before - after
+    offset = np.where(curvature > 0, 0.5 * (after - before) / np.where(curvature > 0, curvature, 1), 0)
+    return np.clip(offset, -0.5, 0.5)
+
+
+def _separated(positions: NDArray[np.float64], separation: float) -> NDArray[np.bool_]:
+    """Which of the positions, best first, have no better one that stays within ``separation``."""
+    stays = np.ones(len(positions), dtype=bool)
+    if len(positions):
+        for better, worse in sorted(cKDTree(positions).query_pairs(separation)):
+            if stays[better]:
+                stays[worse] = False
+    return stays

@@ -306,8 +306,8 @@ class BagReader:
         self.path = Path(path)
         if not self.path.exists():
             raise InputError(str(self.path), "nothing there", "a rosbag2 directory, .mcap or .db3 file")
-        self._reader = AnyReader([self.path], default_typestore=typestore())
         try:
+            self._reader = AnyReader([self.path], default_typestore=typestore())
             self._reader.open()
         except Exception as error:  # a foreign parser on foreign bytes: any failure means the same
             raise InputError(str(self.path), _one_line(error), "a readable bag") from error

@@ -33,9 +33,11 @@ weighted moments and a 7 x 7 transformation per window.
 from __future__ import annotations
 
 import math
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 UNIFORM, LIGHT, LIGHT_RELATIVE, POISSON = 0, 1, 2, 3
 
@@ -43,17 +45,23 @@ LANES = 8
 VARIANCE_FLOOR = 0.01  # electrons^2, as in gaussian.py
 LEAST_SIGMA = 0.7  # px; with LARGEST_ATANH and windows to 65 px no exponential overflows
 LARGEST_ATANH = 1.8  # rho = 0.947
-MAX_ITERATIONS = 60
-START_ITERATIONS = 4  # uniform steps at most before the weighted fit
-TOLERANCE = 1e-5  # expected decrease of chi-square at which to stop, in units of chi-square per pixel
+MOST_ITERATIONS, ROUGH_ITERATIONS = 60, 4
+# Expected decrease of chi-square at which to stop, in units of chi-square per pixel: the last step is
+# then about sqrt(TOLERANCE) standard deviations, and it is still taken.
+TOLERANCE, ROUGH = 1e-4, 1e-2
+MOST_WINDOWS, MOST_OFF_CENTRE = 6, 0.75  # times a window is placed; px
 
-# Sums may be reordered (vectors), divisions stay exact enough, NaN and infinity keep their meaning.
+Array: TypeAlias = NDArray[np.float64]
+Image: TypeAlias = NDArray[np.generic]
+
+# Sums may be reordered (vectors); only where no NaN or infinity can come may the compiler exclude them.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
+_FAST_FINITE = _FAST | {"nnan"}
+_OPTIONS: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 
 @njit(fastmath=_FAST, **_OPTIONS)
-def _shape(theta, window, stride, shape):
+def _shape(theta: Array, window: int, stride: int, shape: Array) -> None:
     """Fill ``shape`` with E, the Gaussian of unit amplitude, outwards from the central pixel."""
     half = window // 2
     x, y = theta[0], theta[1]
@@ -61,48 +69,52 @@ def _shape(theta, window, stride, shape):
     k = 1 / (1 - rho * rho)
     sx, sy = math.exp(theta[3]), math.exp(theta[4])
     a, b, c = k / (sx * sx), -k * rho / (sx * sy), k / (sy * sy)
-    # Central row: chains to the right and to the left.
-    centre = half * stride
-    start = math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y))
-    twist = math.exp(b * x)  # exp(-b u) at the central column
-    tilt = math.exp(b * y)
-    turn, curve = math.exp(-b), math.exp(-a)
-    step = np.empty(stride)
-    e, ratio, t = start, math.exp(a * x - 0.5 * a) * tilt, twist
-    for j in range(half, stride):
-        shape[centre + j], step[j] = e, t
-        e *= ratio
-        ratio *= curve
-        t *= turn
-    e, ratio, t = start, math.exp(-a * x - 0.5 * a) / tilt, twist
-    for j in range(half, -1, -1):
-        shape[centre + j], step[j] = e, t
-        e *= ratio
-        ratio *= curve
-        t /= turn
-    # From row to row: the ratio of neighbours changes by one constant factor.
+    # Central row, both ways at once. E(u+1)/E(u) is a ratio that changes by exp(-a) per column;
+    # exp(-b u) is what a row's ratio to the next one has of the column.
+    curve, turn, back = math.exp(-a), math.exp(-b), math.exp(b)
+    right_ratio, left_ratio = math.exp(a * x - 0.5 * a + b * y), math.exp(-a * x - 0.5 * a - b * y)
+    right = left = math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y))
+    right_turn = left_turn = math.exp(b * x)
+    row = half * stride
+    down, up = np.empty(stride), np.empty(stride)
+    shape[row + half], down[half] = right, right_turn
+    for j in range(1, stride - half):
+        right *= right_ratio
+        right_ratio *= curve
+        right_turn *= turn
+        shape[row + half + j], down[half + j] = right, right_turn
+        if j <= half:
+            left *= left_ratio
+            left_ratio *= curve
+            left_turn *= back
+            shape[row + half - j], down[half - j] = left, left_turn
+    # From row to row, likewise.
     curve = math.exp(-c)
-    ratios = np.empty(stride)
-    down = math.exp(c * y - 0.5 * c)
+    down_ratio, up_ratio = math.exp(c * y - 0.5 * c), math.exp(-c * y - 0.5 * c)
     for j in range(stride):
-        ratios[j] = down * step[j]
-    for i in range(half + 1, window):
-        k0 = i * stride
+        up[j] = up_ratio / down[j]
+        down[j] *= down_ratio
+    for i in range(1, half + 1):
+        below, above = row + i * stride, row - i * stride
         for j in range(stride):
-            shape[k0 + j] = shape[k0 - stride + j] * ratios[j]
-            ratios[j] *= curve
-    up = math.exp(-c * y - 0.5 * c)
-    for j in range(stride):
-        ratios[j] = up / step[j]
-    for i in range(half - 1, -1, -1):
-        k0 = i * stride
+            shape[below + j] = shape[below - stride + j] * down[j]
+            down[j] *= curve
         for j in range(stride):
-            shape[k0 + j] = shape[k0 + stride + j] * ratios[j]
-            ratios[j] *= curve
+            shape[above + j] = shape[above + stride + j] * up[j]
+            up[j] *= curve
 
 
 @njit(fastmath=_FAST, **_OPTIONS)
-def _weigh(theta, data, noise, valid, shape, weighting, weights, pulls):
+def _weigh(
+    theta: Array,
+    data: Array,
+    noise: Array,
+    valid: Array,
+    shape: Array,
+    weighting: int,
+    weights: Array,
+    pulls: Array,
+) -> float:
     """Second and first derivatives of the objective's half by the model: ``weights``, ``pulls``.
 
     Returns the objective. Light-weighting differentiates the variance too where the model is the
@@ -144,7 +156,7 @@ def _weigh(theta, data, noise, valid, shape, weighting, weights, pulls):
 
 
 @njit(fastmath=_FAST, **_OPTIONS)
-def _moments(shape, u, v, weights, moments):
+def _moments(shape: Array, u: Array, v: Array, weights: Array, moments: Array) -> None:
     """The 7 x 7 weighted products of (E, E u, E v, E u^2, E u v, E v^2, 1) from their 22 moments."""
     s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = 0.0
     s40 = s31 = s22 = s13 = s04 = 0.0
@@ -189,7 +201,7 @@ def _moments(shape, u, v, weights, moments):
 
 
 @njit(fastmath=_FAST, **_OPTIONS)
-def _gradient(shape, u, v, pulls, gradient):
+def _gradient(shape: Array, u: Array, v: Array, pulls: Array, gradient: Array) -> None:
     """The seven products of the same functions with ``pulls``."""
     t00 = t10 = t01 = t20 = t11 = t02 = w = 0.0
     for k in range(shape.size):
@@ -207,7 +219,7 @@ def _gradient(shape, u, v, pulls, gradient):
 
 
 @njit(**_OPTIONS)
-def _transformation(theta, t):
+def _transformation(theta: Array, t: Array) -> None:
     """Columns of ``t`` (7, 7): the derivative by each theta in the functions of ``_moments``."""
     x, y, amplitude = theta[0], theta[1], theta[2]
     rho = math.tanh(theta[5])
@@ -232,7 +244,7 @@ def _transformation(theta, t):
 
 
 @njit(**_OPTIONS)
-def _normal(t, moments, normal):
+def _normal(t: Array, moments: Array, normal: Array) -> None:
     """``normal = t' moments t`` (7, 7)."""
     half = np.empty((7, 7))
     for i in range(7):
@@ -251,7 +263,7 @@ def _normal(t, moments, normal):
 
 
 @njit(**_OPTIONS)
-def _factorise(matrix, damping, factor):
+def _factorise(matrix: Array, damping: float, factor: Array) -> bool:
     """Cholesky factor of the matrix with its diagonal raised by ``damping``; False where singular."""
     for i in range(7):
         for j in range(i + 1):
@@ -270,7 +282,7 @@ def _factorise(matrix, damping, factor):
 
 
 @njit(**_OPTIONS)
-def _solve(factor, right, solution):
+def _solve(factor: Array, right: Array, solution: Array) -> None:
     for i in range(7):
         s = right[i]
         for m in range(i):
@@ -283,8 +295,20 @@ def _solve(factor, right, solution):
         solution[i] = s / factor[i, i]
 
 
-@njit(**_OPTIONS)
-def _read_window(image, column, row, offset, gain, read_variance, window, stride, data, read, valid):
+@njit(fastmath=_FAST, **_OPTIONS)
+def _read_window(
+    image: Image,
+    column: int,
+    row: int,
+    offset: Array,
+    gain: Array,
+    read_variance: Array,
+    window: int,
+    stride: int,
+    data: Array,
+    read: Array,
+    valid: Array,
+) -> tuple[int, int]:
     """Electrons of the window about a pixel; what lies outside the image is not valid.
 
     Returns the lines cut off at the worst edge and the largest pixel, ADU.
@@ -293,73 +317,68 @@ def _read_window(image, column, row, offset, gain, read_variance, window, stride
     half = window // 2
     valid[:] = 0.0
     data[:] = 0.0
-    read[:] = 1.0
+    read[:] = read_variance[0, 0]
     top, bottom = max(row - half, 0), min(row + half, height - 1)
     left, right = max(column - half, 0), min(column + half, width - 1)
+    maps = offset.size > 1 or gain.size > 1 or read_variance.size > 1
+    least, scale = offset[0, 0], 1 / gain[0, 0]
     largest = 0
     for i in range(top, bottom + 1):
         k = (i - row + half) * stride - column + half
         for j in range(left, right + 1):
-            adu = image[i, j]
+            adu = np.int64(image[i, j])
             largest = max(largest, adu)
-            o = offset[i, j] if offset.size > 1 else offset[0, 0]
-            g = gain[i, j] if gain.size > 1 else gain[0, 0]
-            data[k + j] = (adu - o) / g
-            read[k + j] = read_variance[i, j] if read_variance.size > 1 else read_variance[0, 0]
+            data[k + j] = (adu - least) * scale
             valid[k + j] = 1.0
+        if maps:
+            for j in range(left, right + 1):
+                o = offset[i, j] if offset.size > 1 else least
+                g = gain[i, j] if gain.size > 1 else gain[0, 0]
+                data[k + j] = (image[i, j] - o) / g
+                read[k + j] = read_variance[i, j] if read_variance.size > 1 else read_variance[0, 0]
     cut = max(max(half - column, half - row), max(column + half - width + 1, row + half - height + 1))
     return max(cut, 0), largest
 
 
-@njit(**_OPTIONS)
-def _start(data, valid, window, stride, theta):
+@njit(fastmath=_FAST_FINITE, **_OPTIONS)
+def _start(data: Array, valid: Array, u: Array, v: Array, window: int, stride: int, theta: Array) -> bool:
     """First parameters from the window alone: border, peak, and moments above 30 % of it.
 
     A Gaussian cut at the fraction f of its height and lowered by it has 0.358 of its variance
-    (f = 0.3): [1 - f (1 + L) - f L^2 / 2] / [1 - f - f L], L = -ln f.
+    (f = 0.3): [1 - f (1 + L) - f L^2 / 2] / [1 - f - f L], L = -ln f. False without contrast.
     """
     half = window // 2
-    background, count = 0.0, 0
-    for i in range(window):
-        for j in range(window):
-            k = i * stride + j
-            if (i == 0 or j == 0 or i == window - 1 or j == window - 1) and valid[k] > 0:
-                background += data[k]
-                count += 1
+    background, count = 0.0, 0.0
+    last = (window - 1) * stride
+    for j in range(window):
+        for k in (j, last + j, j * stride, j * stride + window - 1):
+            background += valid[k] * data[k]
+            count += valid[k]
     if count == 0:
         return False
     background /= count
-    # The peak lies in the inner half, as a mean of nine pixels against noise.
-    peak = -np.inf
+    # The peak lies in the inner half: a mean of three pixels, against noise.
+    peak = background
     for i in range(half // 2, window - half // 2):
-        for j in range(half // 2, window - half // 2):
-            k = i * stride + j
-            if valid[k] > 0:
-                s, n = 0.0, 0.0
-                for m in (-stride, 0, stride):
-                    s += valid[k + m - 1] * data[k + m - 1] + valid[k + m] * data[k + m]
-                    s += valid[k + m + 1] * data[k + m + 1]
-                    n += valid[k + m - 1] + valid[k + m] + valid[k + m + 1]
-                peak = max(peak, s / n)
+        for k in range(i * stride + half // 2, i * stride + window - half // 2):
+            peak = max(peak, (data[k - 1] + data[k] + data[k + 1]) / 3)
     level = background + 0.3 * (peak - background)
-    m0 = mx = my = mxx = mxy = myy = 0.0
-    for i in range(window):
-        for j in range(window):
-            k = i * stride + j
-            f = (data[k] - level) * valid[k]
-            if f > 0:
-                m0 += f
-                mx += f * (j - half)
-                my += f * (i - half)
-                mxx += f * (j - half) * (j - half)
-                mxy += f * (j - half) * (i - half)
-                myy += f * (i - half) * (i - half)
-    if not m0 > 0:
+    m = mx = my = mxx = mxy = myy = 0.0
+    for k in range(data.size):
+        f = valid[k] * max(data[k] - level, 0.0)
+        fu, fv = f * u[k], f * v[k]
+        m += f
+        mx += fu
+        my += fv
+        mxx += fu * u[k]
+        mxy += fu * v[k]
+        myy += fv * v[k]
+    if not (peak > background and m > 0):
         return False
-    x, y = mx / m0, my / m0
-    vx = max((mxx / m0 - x * x) / 0.358, 1.0)
-    vy = max((myy / m0 - y * y) / 0.358, 1.0)
-    rho = (mxy / m0 - x * y) / 0.358 / math.sqrt(vx * vy)
+    x, y = mx / m, my / m
+    vx = max((mxx / m - x * x) / 0.358, 1.0)
+    vy = max((myy / m - y * y) / 0.358, 1.0)
+    rho = (mxy / m - x * y) / 0.358 / math.sqrt(vx * vy)
     theta[0], theta[1], theta[2] = x, y, peak - background
     theta[3], theta[4] = 0.5 * math.log(vx), 0.5 * math.log(vy)
     theta[5] = math.atanh(min(max(rho, -0.7), 0.7))
@@ -368,7 +387,7 @@ def _start(data, valid, window, stride, theta):
 
 
 @njit(**_OPTIONS)
-def _bounded_step(theta, step, window, trial):
+def _bounded_step(theta: Array, step: Array, window: int, trial: Array) -> bool:
     """``trial = theta + step``, the step shortened where a width or a position would leap."""
     longest = max(
         max(abs(step[0]), abs(step[1])) / 3, max(max(abs(step[3]), abs(step[4])), abs(step[5])) / 0.5
@@ -384,23 +403,34 @@ def _bounded_step(theta, step, window, trial):
 
 
 @njit(**_OPTIONS)
-def _inside(theta, window):
-    """Whether the parameters describe a particle in the window, and no bound has been hit."""
-    half = window // 2
+def _inside(theta: Array, window: int) -> bool:
+    """Whether the parameters describe a particle, and no bound has been hit."""
     low, high = math.log(LEAST_SIGMA), math.log(2.0 * window)
     return (
-        abs(theta[0]) <= half
-        and abs(theta[1]) <= half
-        and theta[2] > 0
+        theta[2] > 0
         and low < theta[3] < high
         and low < theta[4] < high
         and abs(theta[5]) < LARGEST_ATANH
-        and theta[6] < np.inf
+        and max(abs(theta[0]), abs(theta[1])) < 1
+        and abs(theta[6]) < np.inf
     )
 
 
 @njit(**_OPTIONS)
-def _minimise(theta, data, noise, valid, u, v, window, stride, weighting, most, tolerance, work):
+def _minimise(
+    theta: Array,
+    data: Array,
+    noise: Array,
+    valid: Array,
+    u: Array,
+    v: Array,
+    window: int,
+    stride: int,
+    weighting: int,
+    most: int,
+    tolerance: float,
+    work: Array,
+) -> int:
     """Levenberg-Marquardt from ``theta`` in place. Returns the iterations; negative: no convergence."""
     shape, weights, pulls = work[0], work[1], work[2]
     moments, t, normal, factor = np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7))
@@ -448,7 +478,20 @@ def _minimise(theta, data, noise, valid, u, v, window, stride, weighting, most, 
 
 
 @njit(**_OPTIONS)
-def _uncertainty(theta, data, read, noise, valid, u, v, window, stride, weighting, work, covariance):
+def _uncertainty(
+    theta: Array,
+    data: Array,
+    read: Array,
+    noise: Array,
+    valid: Array,
+    u: Array,
+    v: Array,
+    window: int,
+    stride: int,
+    weighting: int,
+    work: Array,
+    covariance: Array,
+) -> float:
     """Covariance of x, y, A, sigma_x, sigma_y, rho, B at the solution; returns reduced chi-square.
 
     Pixel variance V = model + read noise. Where the weights are 1/V (light-weighting, Poisson) the
@@ -500,35 +543,34 @@ def _uncertainty(theta, data, read, noise, valid, u, v, window, stride, weightin
 
 @njit(**_OPTIONS)
 def fit_windows(
-    image,
-    starts,
-    offset,
-    gain,
-    read_variance,
-    saturation,
-    window,
-    weighting,
-    kappa,
-    parameters,
-    covariance,
-    quality,
-):
+    image: Image,
+    starts: Array,
+    offset: Array,
+    gain: Array,
+    read_variance: Array,
+    saturation: float,
+    window: int,
+    weighting: int,
+    kappa: float,
+    parameters: Array,
+    covariance: Array,
+    quality: Array,
+) -> None:
     """Fit one Gaussian to the window about each start; NaN parameters where a fit fails.
 
     The window follows the particle: it is moved until its central pixel is the fitted one, so that
     the result does not depend on where the detection put it.
     """
+    height, width = image.shape
     half = window // 2
     stride = (window + LANES - 1) // LANES * LANES
     size = window * stride
     data, read, noise, valid = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    work, theta = np.empty((3, size)), np.empty(7)
     u, v = np.empty(size), np.empty(size)
-    work = np.empty((3, size))
     for k in range(size):
         u[k] = k % stride - half
         v[k] = k // stride - half
-    theta = np.empty(7)
-    height, width = image.shape
     for n in range(len(starts)):
         parameters[n] = np.nan
         covariance[n] = np.nan
@@ -536,58 +578,63 @@ def fit_windows(
         if not (-0.5 <= starts[n, 0] < width - 0.5 and -0.5 <= starts[n, 1] < height - 0.5):
             continue
         column, row = round(starts[n, 0]), round(starts[n, 1])
+        cut, largest = _read_window(
+            image, column, row, offset, gain, read_variance, window, stride, data, read, valid
+        )
         known = starts.shape[1] == 7
-        iterations = 0
-        for attempt in range(4):
-            cut, largest = _read_window(
-                image, column, row, offset, gain, read_variance, window, stride, data, read, valid
-            )
-            if attempt == 0:
-                if known:
-                    theta[:] = starts[n]
-                    theta[0] -= column
-                    theta[1] -= row
-                    theta[3], theta[4] = math.log(theta[3]), math.log(theta[4])
-                    theta[5] = math.atanh(theta[5])
-                elif not _start(data, valid, window, stride, theta):
-                    iterations = -1
+        if known:
+            theta[:] = starts[n]
+            theta[0] -= column
+            theta[1] -= row
+            theta[3], theta[4] = math.log(theta[3]), math.log(theta[4])
+            theta[5] = math.atanh(theta[5])
+        elif not _start(data, valid, u, v, window, stride, theta):
+            continue
+        # First a rough uniform fit: a robust start for every weighting, and the amplitude that scales
+        # the relative one. Then the fit itself, repeated where it has left the centre of its window.
+        rough = weighting == LIGHT_RELATIVE or not (known or weighting == UNIFORM)
+        iterations, done = 0, -1
+        for _ in range(MOST_WINDOWS):
+            if max(abs(theta[0]), abs(theta[1])) > MOST_OFF_CENTRE:
+                move_x, move_y = round(theta[0]), round(theta[1])
+                column, row = column + move_x, row + move_y
+                if not (0 <= column < width and 0 <= row < height):
+                    done = -1
                     break
-            if weighting != UNIFORM and (attempt > 0 or not known or weighting == LIGHT_RELATIVE):
-                # A rough uniform fit: robust start of every weighting, amplitude scale of the relative one.
+                theta[0] -= move_x
+                theta[1] -= move_y
+                cut, largest = _read_window(
+                    image, column, row, offset, gain, read_variance, window, stride, data, read, valid
+                )
+            if rough:
+                rough = False
                 iterations += abs(
                     _minimise(
-                        theta, data, read, valid, u, v, window, stride, UNIFORM, START_ITERATIONS, 1e-2, work
+                        theta, data, read, valid, u, v, window, stride, UNIFORM, ROUGH_ITERATIONS, ROUGH, work
                     )
                 )
+                scale = kappa * theta[2] - theta[6]
+                continue
             if weighting == LIGHT_RELATIVE:
-                noise[:] = kappa * theta[2] - theta[6]
+                noise[:] = scale
             else:
                 noise[:] = read
             done = _minimise(
-                theta, data, noise, valid, u, v, window, stride, weighting, MAX_ITERATIONS, TOLERANCE, work
+                theta, data, noise, valid, u, v, window, stride, weighting, MOST_ITERATIONS, TOLERANCE, work
             )
             iterations += abs(done)
-            if done < 0 or not _inside(theta, window):
-                iterations = -iterations
+            if done < 0 or max(abs(theta[0]), abs(theta[1])) <= MOST_OFF_CENTRE:
                 break
-            if max(abs(theta[0]), abs(theta[1])) <= 0.75:
-                break
-            move_x, move_y = round(theta[0]), round(theta[1])
-            if not (0 <= column + move_x < width and 0 <= row + move_y < height):
-                break
-            column, row = column + move_x, row + move_y
-            theta[0] -= move_x
-            theta[1] -= move_y
-        quality[n, 1] = abs(iterations)
-        if iterations <= 0:
+        quality[n, 1] = iterations
+        if done < 0 or not _inside(theta, window):
             continue
-        quality[n, 2] = cut
-        quality[n, 3] = 1.0 if largest >= saturation else 0.0
-        quality[n, 0] = _uncertainty(
+        chi_square = _uncertainty(
             theta, data, read, noise, valid, u, v, window, stride, weighting, work, covariance[n]
         )
-        if math.isnan(quality[n, 0]):
-            covariance[n] = np.nan
+        quality[n, 0] = chi_square
+        quality[n, 2] = cut
+        quality[n, 3] = 1.0 if largest >= saturation else 0.0
+        if math.isnan(chi_square):
             continue
         parameters[n, 0], parameters[n, 1] = column + theta[0], row + theta[1]
         parameters[n, 2], parameters[n, 6] = theta[2], theta[6]

@@ -1,0 +1,81 @@
+"""How messages travel: Fast DDS profiles, quality of service, large buffers.
+
+Without a profile, a 2048 x 2048 frame goes in 64 kB fragments through a shared-memory segment of half a
+megabyte, and a reader of 90 of them a second loses some. The profiles here size the segment
+for frames; only processes that publish frames pay for the large one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+from pathlib import Path
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from mems6dof_ros.errors import Mems6dofError
+
+_SHARED_MEMORY = Path("/dev/shm")
+_MEBIBYTE = 2**20
+#: Profile and what its segment with everything around it takes of /dev/shm, MiB.
+_MESSAGES = (Path(__file__).with_name("fastdds.xml"), 10)
+_FRAMES = (Path(__file__).with_name("fastdds_frames.xml"), 136)
+
+# Jazzy reads the first name only, Kilted calls it deprecated.
+_PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_LOCALHOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def use_profile(*, frames: bool) -> str:
+    """Choose the Fast DDS profile of this process, before ``rclpy.init``; returns a warning or "".
+
+    ``frames``: the process publishes images. A profile, or another middleware, that the user has set in the
+    environment stays. Raises Mems6dofError where /dev/shm is too full for any ROS 2 process to start:
+    Fast DDS would die without a word.
+    """
+    if os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
+        return ""
+    given = {os.environ[name] for name in _PROFILE_VARIABLES if name in os.environ}
+    if given - {str(_MESSAGES[0]), str(_FRAMES[0])}:
+        return ""
+    warning = ""
+    profile, need = _FRAMES if frames else _MESSAGES
+    free = shutil.disk_usage(_SHARED_MEMORY).free // _MEBIBYTE if _SHARED_MEMORY.is_dir() else need
+    if free < _MESSAGES[1]:
+        raise Mems6dofError(
+            f"{_SHARED_MEMORY}: found {free} MiB free; expected {need} MiB or more: remove {_SHARED_MEMORY}/fastrtps_*"
+            " left by killed processes while no ROS 2 process runs, or enlarge it"
+        )
+    if free < need:
+        warning = f"{_SHARED_MEMORY} has {free} MiB free, {need} MiB are needed: large frames will be slow or lost"
+        profile = _MESSAGES[0]
+    for name in _PROFILE_VARIABLES:
+        os.environ[name] = str(profile)
+    return warning
+
+
+def localhost_only() -> dict[str, str]:
+    """Environment of processes that only talk to processes on this machine."""
+    return dict(_LOCALHOST)
+
+
+def reliable(depth: int) -> QoSProfile:
+    """Quality of service of every topic here: reliable, the last ``depth`` messages kept."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+def keep_large_buffers() -> None:
+    """Let glibc reuse the memory of frames instead of returning it to the kernel after each."""
+    trim_threshold, mmap_threshold = -1, -3  # malloc.h
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):  # another C library
+        return
+    mallopt(mmap_threshold, 32 * _MEBIBYTE)  # the greatest it accepts
+    mallopt(trim_threshold, 512 * _MEBIBYTE)

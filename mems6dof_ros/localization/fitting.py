@@ -13,13 +13,16 @@ from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
 #: The weightings by name. ``docs/localization.md`` defines and compares them.
 WEIGHTINGS = {
+    "relative_light_weighting": kernels.RELATIVE,
     "light_weighting": kernels.LIGHT,
-    "light_weighting_relative": kernels.LIGHT_RELATIVE,
     "uniform": kernels.UNIFORM,
     "poisson": kernels.POISSON,
 }
 
-#: Variance floor of the relative light-weighting, in units of the amplitude.
+#: The best by measurement: as precise as light-weighting, and what it measures does not depend on brightness.
+DEFAULT_WEIGHTING = "relative_light_weighting"
+
+#: Least variance of the relative light-weighting, in units of the amplitude.
 KAPPA = 0.1
 
 SMALLEST_WINDOW_PX, LARGEST_WINDOW_PX = 7, 65
@@ -29,7 +32,7 @@ def fit_gaussians(
     image: NDArray[np.generic],
     positions_px: ArrayLike,
     camera: CameraNoise,
-    weighting: str = "light_weighting",
+    weighting: str = DEFAULT_WEIGHTING,
     window_px: int = 31,
     kappa: float = KAPPA,
     start: GaussianFits | None = None,
@@ -38,7 +41,7 @@ def fit_gaussians(
 
     ``image`` (height, width) uint8 or uint16, ADU; ``positions_px`` (n, 2), column and row, good to
     about a particle's radius; ``weighting`` one of WEIGHTINGS; ``window_px`` odd side of the window;
-    ``kappa`` variance floor over amplitude of ``light_weighting_relative``. ``start``: earlier fits of
+    ``kappa`` variance floor over amplitude of ``relative_light_weighting``. ``start``: earlier fits of
     the same particles, n of them, whose shapes start the new fits at ``positions_px``, which then must
     be good to a pixel.
 

@@ -12,8 +12,8 @@ gain           (h, w) or (1, 1)    ADU per electron
 read_variance  (h, w) or (1, 1)    electrons^2
 saturation     number              ADU
 window         odd number          side of the window, px
-weighting      number              UNIFORM, LIGHT, LIGHT_RELATIVE, POISSON
-kappa          number              LIGHT_RELATIVE only: variance floor over amplitude
+weighting      number              UNIFORM, RELATIVE, LIGHT, POISSON
+kappa          number              RELATIVE only: variance floor over amplitude
 parameters     (n, 7)              out: x, y, A, sigma_x, sigma_y, rho, B of the image; px, electrons
 covariance     (n, 7, 7)           out
 quality        (n, 4)              out: reduced chi-square, iterations, lines cut off, saturated pixels
@@ -39,7 +39,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-UNIFORM, LIGHT, LIGHT_RELATIVE, POISSON = 0, 1, 2, 3
+UNIFORM, RELATIVE, LIGHT, POISSON = 0, 1, 2, 3
 
 LANES = 8
 VARIANCE_FLOOR = 0.01  # electrons^2, as in gaussian.py
@@ -122,12 +122,12 @@ def _weigh(
     """
     amplitude, background = theta[2], theta[6]
     total = 0.0
-    if weighting == UNIFORM:
+    if weighting in (UNIFORM, RELATIVE):
         for k in range(data.size):
             r = data[k] - (amplitude * shape[k] + background)
-            weights[k] = valid[k]
-            pulls[k] = valid[k] * r
-            total += valid[k] * r * r
+            weights[k] = noise[k]
+            pulls[k] = noise[k] * r
+            total += pulls[k] * r
     elif weighting == POISSON:
         for k in range(data.size):
             if valid[k] > 0:
@@ -507,10 +507,8 @@ def _uncertainty(
         r = data[k] - model
         chi += valid[k] * r * r / variance
         pixels += valid[k]
-        if weighting == UNIFORM:
-            weights[k] = valid[k]
-        elif weighting == LIGHT_RELATIVE:
-            weights[k] = valid[k] / max(model + noise[k], VARIANCE_FLOOR)
+        if weighting in (UNIFORM, RELATIVE):
+            weights[k] = noise[k]
         else:
             weights[k] = valid[k] / variance
         meat[k] = weights[k] * weights[k] * variance
@@ -527,7 +525,7 @@ def _uncertainty(
         unit[i] = 1.0
         _solve(factor, unit, column)
         inverse[i] = column
-    if weighting in (UNIFORM, LIGHT_RELATIVE):
+    if weighting in (UNIFORM, RELATIVE):
         _moments(shape, u, v, meat, moments)
         _normal(t, moments, middle)
         _normal(inverse, middle, covariance)
@@ -566,7 +564,7 @@ def fit_windows(
     stride = (window + LANES - 1) // LANES * LANES
     size = window * stride
     data, read, noise, valid = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
-    work, theta = np.empty((3, size)), np.empty(7)
+    work, shape, theta = np.empty((3, size)), np.empty(size), np.empty(7)
     u, v = np.empty(size), np.empty(size)
     for k in range(size):
         u[k] = k % stride - half
@@ -592,7 +590,7 @@ def fit_windows(
             continue
         # First a rough uniform fit: a robust start for every weighting, and the amplitude that scales
         # the relative one. Then the fit itself, repeated where it has left the centre of its window.
-        rough = weighting == LIGHT_RELATIVE or not (known or weighting == UNIFORM)
+        rough = weighting == RELATIVE or not (known or weighting == UNIFORM)
         iterations, done = 0, -1
         for _ in range(MOST_WINDOWS):
             if max(abs(theta[0]), abs(theta[1])) > MOST_OFF_CENTRE:
@@ -610,15 +608,29 @@ def fit_windows(
                 rough = False
                 iterations += abs(
                     _minimise(
-                        theta, data, read, valid, u, v, window, stride, UNIFORM, ROUGH_ITERATIONS, ROUGH, work
+                        theta,
+                        data,
+                        valid,
+                        valid,
+                        u,
+                        v,
+                        window,
+                        stride,
+                        UNIFORM,
+                        ROUGH_ITERATIONS,
+                        ROUGH,
+                        work,
                     )
                 )
-                scale = kappa * theta[2] - theta[6]
+                _shape(theta, window, stride, shape)
                 continue
-            if weighting == LIGHT_RELATIVE:
-                noise[:] = scale
-            else:
-                noise[:] = read
+            for k in range(size):
+                if weighting == UNIFORM:
+                    noise[k] = valid[k]
+                elif weighting == RELATIVE:
+                    noise[k] = valid[k] / (shape[k] + kappa)
+                else:
+                    noise[k] = read[k]
             done = _minimise(
                 theta, data, noise, valid, u, v, window, stride, weighting, MOST_ITERATIONS, TOLERANCE, work
             )

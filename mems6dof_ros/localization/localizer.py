@@ -14,7 +14,7 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.detection import DetectionSettings, detect
-from mems6dof_ros.localization.fitting import fit_gaussians
+from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, fit_gaussians
 from mems6dof_ros.localization.localizations import Flag, GaussianFits, Localizations
 
 #: Relative difference of two pixel sizes that still counts as equal: 0.03 um over the field of 260 um.
@@ -35,7 +35,7 @@ class LocalizerSettings:
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
-    weighting: str = "light_weighting"
+    weighting: str = DEFAULT_WEIGHTING
     window_px: int = 31
     pixel_size: float = math.nan
     neighbour_distance: float = 4e-6

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mems6dof_ros.simulation.optics import WINDOW_PX, ParticleImages
+from mems6dof_ros.simulation.optics import ParticleImages
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 _MARGIN = 128  # by so many pixels the noise bank is larger than an image
@@ -25,10 +25,10 @@ class Camera:
     place, and the light of particles is drawn only where there is any. Read noise comes likewise
     from a bank of normal numbers, scaled by the map. The price: two frames share background noise
     shifted by a random vector (one pair in 16 641 unshifted; read noise has its own shift), and the smooth
-    illumination of the background moves along by up to 64 px.
+    illumination of the background moves along by up to 64 px. ``rng`` draws all noise.
     """
 
-    def __init__(self, settings: SimulationSettings) -> None:
+    def __init__(self, settings: SimulationSettings, rng: np.random.Generator) -> None:
         self.gain = settings.gain
         self.offset_adu = settings.offset_adu
         self.read_noise = settings.read_noise
@@ -45,26 +45,27 @@ class Camera:
         self.read_noise_map = np.float32(settings.read_noise) * np.exp(spread(settings.read_noise_spread))
         self._read_map_adu = self.read_noise_map * self.gain_map
 
-        bank = np.random.default_rng([settings.seed, 0xBA2C])
         bank_shape = shape[0] + _MARGIN, shape[1] + _MARGIN
         mean = settings.background * illumination_map(bank_shape, settings)
-        self._background = bank.poisson(mean).astype(np.uint16)
-        self._read = bank.standard_normal(bank_shape, dtype=np.float32)
+        self._background = rng.poisson(mean).astype(np.uint16)
+        self._read = rng.standard_normal(bank_shape, dtype=np.float32)
         self._signal = np.zeros(shape, np.int32)
+        self._rng = rng
 
-    def expose(self, images: ParticleImages, rng: np.random.Generator) -> NDArray[np.generic]:
+    def expose(self, images: ParticleImages) -> NDArray[np.generic]:
         """One digital image (height, width), uint8 or uint16, of the rendered ``images`` on background."""
         height, width = self._signal.shape
+        side = images.image.shape[-1]
         touched = []
         for (column, row), window in zip(images.corner, images.image, strict=True):
-            rows = slice(max(row, 0), min(row + WINDOW_PX, height))
-            columns = slice(max(column, 0), min(column + WINDOW_PX, width))
+            rows = slice(max(row, 0), min(row + side, height))
+            columns = slice(max(column, 0), min(column + side, width))
             if rows.start >= rows.stop or columns.start >= columns.stop:
                 continue
             part = window[rows.start - row : rows.stop - row, columns.start - column : columns.stop - column]
-            self._signal[rows, columns] += rng.poisson(part).astype(np.int32)
+            self._signal[rows, columns] += self._rng.poisson(part).astype(np.int32)
             touched.append((rows, columns))
-        by, bx, ry, rx = rng.integers(0, _MARGIN + 1, 4)
+        by, bx, ry, rx = self._rng.integers(0, _MARGIN + 1, 4)
         digital = np.empty((height, width), self._dtype)
         _digitize(
             self._background[by : by + height, bx : bx + width],

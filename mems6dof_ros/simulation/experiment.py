@@ -25,7 +25,7 @@ class Experiment:
 
     def __init__(self, settings: SimulationSettings) -> None:
         self.settings = settings
-        self.microscope = Microscope(settings)
+        self.microscope = Microscope(settings, np.random.default_rng([settings.seed, 10]))
         self.gear = LoadGear(settings)
         half_width, half_height = (0.5 * size * settings.pixel_size for size in settings.image_size)
         self._strays = scatter_particles(
@@ -66,13 +66,27 @@ def motion_frames(settings: SimulationSettings, cycles: int) -> Iterator[Frame]:
         yield experiment.frame()
 
 
+def revolution(settings: SimulationSettings) -> list[Frame]:
+    """The frames of one revolution that closes exactly, for ``loop``: a drive without error.
+
+    Raises InputError unless the step divides a revolution.
+    """
+    cycles = round(2 * math.pi / abs(settings.step)) if settings.step else 0
+    if not math.isclose(cycles * abs(settings.step), 2 * math.pi, rel_tol=1e-9):
+        raise InputError("simulation setting step", f"{settings.step} rad", "a whole fraction of 2 pi")
+    exact = dataclasses.replace(
+        settings, step_error=0.0, step_jitter=0.0, stall_probability=0.0, skip_probability=0.0
+    )
+    return list(motion_frames(exact, cycles))
+
+
 def loop(frames: Sequence[Frame], frame_rate: float = 90.0) -> Iterator[Frame]:
     """Repeat pre-rendered ``frames`` without end, as from a gear that turns on.
 
     Stamps, frame counters and cycles continue, at ``frame_rate`` Hz; psi of a body that turned goes on by
     whole revolutions. The images repeat, noise included, and so do play and tilt: right for measuring
-    rate and latency, not for statistics beyond the first pass. Where the frames do not close a
-    revolution exactly, the seam is a step of that size. Raises InputError without frames.
+    rate and latency, not for statistics beyond the first pass. Frames that do not close a revolution
+    (see ``revolution``) jump where they start again. Raises InputError without frames.
     """
     if not frames:
         raise InputError("loop", "no frames", "at least one")
@@ -116,7 +130,9 @@ class BeadSubstrate:
         seed: int = 0,
     ) -> None:
         self.settings = settings
-        self.microscope = Microscope(settings)
+        # Another substrate, or the same one turned, is another measurement: its noise differs.
+        which = [settings.seed, 20, seed, int(np.float64(rotation).view(np.uint64))]
+        self.microscope = Microscope(settings, np.random.default_rng(which))
         width, height = settings.image_size
         self._beads = scatter_particles(
             settings,

@@ -12,7 +12,7 @@ from mems6dof_ros.frame import Frame, GroundTruth
 from mems6dof_ros.simulation.aberrations import FieldAberrations
 from mems6dof_ros.simulation.camera import Camera, illumination
 from mems6dof_ros.simulation.microsystem import BodyPose, Particles
-from mems6dof_ros.simulation.optics import WINDOW_PX, Objective, Optics
+from mems6dof_ros.simulation.optics import Objective, Optics
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 
@@ -26,15 +26,14 @@ class Body(NamedTuple):
 
 
 class Microscope:
-    """Optics, camera and clock. Frames count from 0; ``time_ns`` is the next frame's stamp."""
+    """Optics and camera. Frames count from 0; ``noise`` draws what differs from frame to frame."""
 
-    def __init__(self, settings: SimulationSettings) -> None:
+    def __init__(self, settings: SimulationSettings, noise: np.random.Generator) -> None:
         self.settings = settings
         objective = Objective(settings.numerical_aperture, settings.wavelength, settings.pixel_size)
         aberrations = FieldAberrations.from_preset(settings.optics, settings.optics_seed, settings.wavelength)
         self.optics = Optics(objective, aberrations)
-        self.camera = Camera(settings)
-        self._shot_noise = np.random.default_rng([settings.seed, 10])
+        self.camera = Camera(settings, noise)
         self._frames = 0
 
     def frame(
@@ -72,7 +71,7 @@ class Microscope:
                     electrons=light[inside],
                 )
             )
-            shows = (np.abs(pixel) < (size + WINDOW_PX) / 2).all(axis=1) & (light > 0)
+            shows = (np.abs(pixel) < (size + self.optics.window_px) / 2).all(axis=1) & (light > 0)
             positions.append(position[shows])
             electrons.append(light[shows])
             diameters.append(body.particles.diameter[shows])
@@ -83,7 +82,7 @@ class Microscope:
             settings.image_size,
         )
         frame = Frame(
-            image=self.camera.expose(images, self._shot_noise),
+            image=self.camera.expose(images),
             stamp_ns=settings.epoch_ns + round(period * 1e9 / settings.frame_rate),
             frame_counter=self._frames,
             cycle=cycle,

@@ -24,15 +24,16 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 from scipy.special import j0, j1, roots_jacobi
 
+from mems6dof_ros.errors import InputError
 from mems6dof_ros.simulation.aberrations import TERMS, FieldAberrations
 
-#: Side of a rendered window, camera pixels (11.2 um at the paper's pixel size); even.
-WINDOW_PX = 88
+#: Side of the window in which a particle is rendered, m; at 5 um defocus it holds 95 % of the light.
+WINDOW = 11.2e-6
 
-_COARSE = WINDOW_PX // 2  # samples across the window at twice the camera's pixel
-_PERIOD = 2.0  # period of the pupil's sampling in windows: further light cannot fold back
+_PERIOD = 2.0  # of the pupil's sampling, in windows: room for the light that leaves the window
 _EDGE_MARGIN = 3  # pupil samples beyond the hard edge
 _BATCH = 16  # particles at once: keeps the work in the processor's cache
 
@@ -43,8 +44,8 @@ _WEIGHTS = 0.5 * _WEIGHTS / _WEIGHTS.sum()
 
 
 class ParticleImages(NamedTuple):
-    """Rendered windows: ``corner`` (n, 2) column and row of the first pixel; ``image`` (n, WINDOW_PX,
-    WINDOW_PX) expected electrons per pixel, float32."""
+    """Rendered windows: ``corner`` (n, 2) column and row of the first pixel; ``image`` (n, window_px,
+    window_px) expected electrons per pixel, float32."""
 
     corner: NDArray[np.int64]
     image: NDArray[np.float32]
@@ -63,7 +64,9 @@ class Optics:
     """Renders spheres at positions in the microscope frame.
 
     The image of a particle at (X, Y, z) uses the aberrations at (X, Y), the defocus above the focal
-    surface there, and the shift that the chief ray's slope gives at that defocus.
+    surface there, and the shift that the chief ray's slope gives at that defocus. ``window_px`` is the side
+    of a rendered window. Raises InputError for pixels too coarse to sample the image (over
+    lambda/(4 NA)).
     """
 
     def __init__(self, objective: Objective, aberrations: FieldAberrations) -> None:
@@ -71,11 +74,15 @@ class Optics:
         self.aberrations = aberrations
         pixel = objective.pixel_size
         cutoff = objective.numerical_aperture / objective.wavelength
-
         na2 = objective.numerical_aperture**2
+        if pixel > 0.25 / cutoff:
+            raise InputError("pixel_size", f"{pixel} m", f"at most {0.25 / cutoff:.3g} m, lambda/(4 NA)")
+        binning = 2 if pixel <= 0.125 / cutoff else 1
+        self.window_px = 4 * round(WINDOW / pixel / 4)
+        self._coarse = self.window_px // binning
 
         # Pupil samples, and a margin for the edge, which the finite window makes soft.
-        pitch = 1 / (_PERIOD * WINDOW_PX * pixel)
+        pitch = 1 / (_PERIOD * self.window_px * pixel)
         half = math.ceil(cutoff / pitch) + _EDGE_MARGIN
         f = np.arange(-half, half + 1) * pitch
         px, py = np.meshgrid(f / cutoff, f / cutoff)
@@ -87,18 +94,18 @@ class Optics:
         self._zernikes = (2 * math.pi * _zernikes(px, py)).reshape(len(TERMS), -1).astype(np.float32)
         # The piston k z is arbitrary; without it single precision is ample.
         self._axial = (2 * math.pi / objective.wavelength * (cosine - 1)).astype(np.float32)
-        x = (np.arange(_COARSE) - _COARSE // 2) * 2 * pixel
+        x = (np.arange(self._coarse) - self._coarse // 2) * binning * pixel
         self._to_image = np.exp(2j * math.pi * np.outer(f, x)).astype(np.complex64)
         self._from_pupil = np.ascontiguousarray(self._to_image.T)
 
         # Fourier domain of the coarse window: frequencies in cycles per camera pixel.
-        self._fx = scipy.fft.rfftfreq(_COARSE, 2).astype(np.float32)
-        self._fy = scipy.fft.fftfreq(_COARSE, 2).astype(np.float32)
+        self._fx = scipy.fft.rfftfreq(self._coarse, binning).astype(np.float32)
+        self._fy = scipy.fft.fftfreq(self._coarse, binning).astype(np.float32)
         self._frequency = np.hypot(*np.meshgrid(self._fx, self._fy)) / pixel
         self._pixel_transfer = np.sinc(self._fy)[:, None] * np.sinc(self._fx)
         # Beyond the optical cutoff there is nothing but the cut of the window; the edge bins of
         # an even transform have no sign and could not be shifted.
-        self._pixel_transfer[_COARSE // 2] = 0
+        self._pixel_transfer[self._coarse // 2] = 0
         self._pixel_transfer[:, -1] = 0
 
     def render(
@@ -110,7 +117,7 @@ class Optics:
     ) -> ParticleImages:
         """Images of n spheres at ``position`` (n, 3) m, in the microscope frame.
 
-        ``electrons`` (n,) expected in the whole plane, of which a window of WINDOW_PX holds about
+        ``electrons`` (n,) expected in the whole plane, of which a window holds about
         98 % in focus; ``diameter`` m, (n,) or one for all; ``image_size`` (width, height) px fixes where
         the microscope frame's origin lies. Windows may reach beyond the image.
         """
@@ -124,12 +131,12 @@ class Optics:
         pixel = apparent / self.objective.pixel_size + (np.asarray(image_size) - 1) / 2
         nearest = np.rint(pixel).astype(np.int64)
         shift = pixel - nearest
-        image = np.empty((len(position), WINDOW_PX, WINDOW_PX), np.float32)
+        image = np.empty((len(position), self.window_px, self.window_px), np.float32)
         for first in range(0, len(position), _BATCH):
             part = slice(first, first + _BATCH)
             image[part] = self._windows(waves[part], defocus[part], shift[part], diameter[part])
             image[part] *= electrons[part, None, None].astype(np.float32)
-        return ParticleImages(nearest - WINDOW_PX // 2, image)
+        return ParticleImages(nearest - self.window_px // 2, image)
 
     def _windows(
         self,
@@ -138,13 +145,13 @@ class Optics:
         shift: NDArray[np.float64],
         diameter: NDArray[np.float64],
     ) -> NDArray[np.float32]:
-        """Windows of unit flux, centred on pixel WINDOW_PX // 2 plus ``shift`` (n, 2) px."""
-        n, side = len(defocus), len(self._axial)
+        """Windows of unit flux, centred on pixel window_px // 2 plus ``shift`` (n, 2) px."""
+        n, side, half = len(defocus), len(self._axial), self._coarse // 2
         phase = (waves.astype(np.float32) @ self._zernikes).reshape(n, side, side)
         phase += defocus.astype(np.float32)[:, None, None] * self._axial
         pupil = self._amplitude * _unit_phasor(phase)
 
-        spectrum = np.zeros((n, _COARSE, _COARSE // 2 + 1), np.complex64)
+        spectrum = np.zeros((n, self._coarse, half + 1), np.complex64)
         for node, weight in zip(_HEIGHTS, _WEIGHTS, strict=True):
             # A disc above the centre is further out of focus by its height, one below it nearer.
             height = (0.5 * node * diameter).astype(np.float32)[:, None, None]
@@ -158,17 +165,16 @@ class Optics:
         ramp_x = np.exp(-2j * np.float32(math.pi) * shift[:, :1] * self._fx)
         ramp_y = np.exp(-2j * np.float32(math.pi) * shift[:, 1:] * self._fy)
         spectrum *= ramp_y[:, :, None] * ramp_x[:, None, :]
-        padded = np.zeros((n, WINDOW_PX, WINDOW_PX // 2 + 1), np.complex64)
-        half = _COARSE // 2
+        padded = np.zeros((n, self.window_px, self.window_px // 2 + 1), np.complex64)
         padded[:, :half, : half + 1] = spectrum[:, :half]
         padded[:, -half:, : half + 1] = spectrum[:, half:]
-        image = scipy.fft.irfft2(padded) * np.float32((WINDOW_PX / _COARSE) ** 2)
+        image = scipy.fft.irfft2(padded) * np.float32((self.window_px / self._coarse) ** 2)
         return np.maximum(image, 0, out=image)
 
     def _intensity(self, pupil: NDArray[np.complex64]) -> NDArray[np.float32]:
-        """Intensity on the coarse grid, (n, _COARSE, _COARSE), of pupils (n, side, side)."""
+        """Intensity on the coarse grid, (n, coarse, coarse), of pupils (n, side, side)."""
         n, side, _ = pupil.shape
-        rows = (pupil.reshape(-1, side) @ self._to_image).reshape(n, side, _COARSE)
+        rows = (pupil.reshape(-1, side) @ self._to_image).reshape(n, side, self._coarse)
         field = self._from_pupil @ rows
         return field.real**2 + field.imag**2
 
@@ -211,7 +217,7 @@ def _soft_aperture(rho2: NDArray[np.float64], radius: float) -> NDArray[np.float
     window = np.sin(0.5 * math.pi * fade) ** 2
     rho, inverse = np.unique(np.sqrt(rho2).round(9), return_inverse=True)
     kernel = window * j1(2 * math.pi * x)
-    aperture = 2 * math.pi * np.trapezoid(kernel * j0(2 * math.pi * rho[:, None] * x), x, axis=1)
+    aperture = 2 * math.pi * trapezoid(kernel * j0(2 * math.pi * rho[:, None] * x), x, axis=1)
     return aperture[inverse].reshape(rho2.shape)
 
 
@@ -224,19 +230,19 @@ def _disc_transfer(frequency: NDArray[np.float64], radius: NDArray[np.float64]) 
 def cramer_rao(
     optics: Optics,
     position: NDArray[np.float64],
-    electrons: float,
+    electrons: NDArray[np.float64] | float,
     background: float,
     *,
-    diameter: float = 1e-6,
+    diameter: NDArray[np.float64] | float = 1e-6,
     read_noise: float = 0.0,
 ) -> NDArray[np.float64]:
     """Smallest standard deviations of (x, y, z, electrons, background), (n, 5); m and electrons.
 
-    For n particles at ``position`` (n, 3) m, each alone in its window with ``electrons`` and a
-    ``background`` in electrons per pixel. The inverse of the Fisher information
-    I_ab = sum_pixels (d mu/d a)(d mu/d b)/(mu + s^2), with ``read_noise`` s (electrons rms) counted as
-    Poisson variance (Huang et al., Nat. Methods 10, 653, 2013); derivatives are central differences of
-    the rendered images.
+    For n particles at ``position`` (n, 3) m, each alone in its window, with ``electrons`` in the whole plane
+    and ``diameter`` m, (n,) or one for all, on ``background`` electrons per pixel. The inverse of the
+    Fisher information I_ab = sum_pixels (d mu/d a)(d mu/d b)/(mu + s^2), with ``read_noise`` s
+    (electrons rms) counted as Poisson variance (Huang et al., Nat. Methods 10, 653, 2013); derivatives
+    are central differences of the rendered images.
     """
     position = np.atleast_2d(np.asarray(position, dtype=float))
     # Steps at which neither curvature (scales of 300 nm and 1 um) nor single precision matters.
@@ -245,16 +251,17 @@ def cramer_rao(
     waves = optics.aberrations.coefficients(position[:, :2])
     defocus = position[:, 2] - optics.aberrations.focal_surface(position[:, :2])
     slope = optics.aberrations.chief_ray_slope(position[:, :2])
+    electrons = np.broadcast_to(np.asarray(electrons, dtype=float), len(position))
+    diameter = np.broadcast_to(np.asarray(diameter, dtype=float), len(position))
     bounds = np.empty((len(position), 5))
     for i in range(len(position)):
         at = defocus[i] + moves[:, 2]
         shift = (position[i, :2] + moves[:, :2] + slope[i] * at[:, None]) / optics.objective.pixel_size
         shift -= np.rint(shift[-1])
-        image = electrons * optics._windows(
-            np.tile(waves[i], (len(moves), 1)), at, shift, np.full(len(moves), diameter)
-        ).astype(float)
+        unit = optics._windows(np.tile(waves[i], (len(at), 1)), at, shift, np.full(len(at), diameter[i]))
+        image = electrons[i] * unit.astype(float)
         derivative = [(image[a] - image[a + 3]) / (2 * steps[a, a]) for a in range(3)]
-        derivative += [image[6] / electrons, np.ones_like(image[6])]
+        derivative += [image[6] / electrons[i], np.ones_like(image[6])]
         columns = np.stack(derivative).reshape(5, -1)
         variance = (image[6] + background + read_noise**2).ravel()
         # Scaled to unit diagonal: metres and electrons differ by ten orders.

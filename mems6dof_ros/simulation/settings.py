@@ -65,7 +65,7 @@ class SimulationSettings:
     clumps: int = _number(2, "1", 0, 1000, "of which so many touch another particle")
     stray_particles: int = _number(0, "1", 0, 5000, "particles that stand still, not on the gear")
     missing: float = _number(0.0, "1", 0.0, 1.0, "chance of a particle to be dark in a frame")
-    diameter: float = _number(1e-6, "m", 50e-9, 3e-6, "mean diameter of the spheres")
+    diameter: float = _number(1e-6, "m", 50e-9, 2e-6, "mean diameter of the spheres")
     diameter_spread: float = _number(0.02, "1", 0.0, 0.2, "relative sd of the diameter")
     height_relief: float = _number(100e-9, "m", 0.0, 5e-6, "sd of the particles' heights on the gear")
     electrons: float = _number(6e4, "electrons", 0.0, 1e8, "mean over the particles, per frame")
@@ -142,9 +142,10 @@ class SimulationSettings:
 
 def _check(spec: dataclasses.Field[Any], value: Any) -> None:
     """Raise InputError unless ``value`` suits the field ``spec``."""
+    where = f"simulation setting {spec.name}"
     if "choices" in spec.metadata:
         if value not in spec.metadata["choices"]:
-            raise InputError(spec.name, repr(value), f"one of {', '.join(spec.metadata['choices'])}")
+            raise InputError(where, repr(value), f"one of {', '.join(spec.metadata['choices'])}")
         return
     low, high = spec.metadata["range"]
     whole = spec.type == "int"
@@ -152,4 +153,4 @@ def _check(spec: dataclasses.Field[Any], value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
         unit = spec.metadata["unit"]
         expected = f"{'a whole number' if whole else 'a number'} from {low:g} to {high:g} {unit}"
-        raise InputError(spec.name, repr(value), expected)
+        raise InputError(where, repr(value), expected)

@@ -1,0 +1,141 @@
+"""Maximum likelihood in defocus: where on its curve does a particle's shape lie?
+
+    L(u) = r' C(u)^-1 r + ln det C(u),   r = q - q_model(u),   C = fit noise + scatter of the model
+
+is examined over the whole calibrated range, because two defoci on either side of focus can explain one
+shape. The two best minima are refined; their difference in L tells how ambiguous the particle is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_REFINEMENTS = 8
+
+
+@njit(cache=True, nogil=True)
+def search_defocus(
+    measured: Array, noise: Array, local: Array, grid: Array, basis: Array, slope_basis: Array, scatter: Array
+) -> tuple[Array, Array, Array]:
+    """Best and second-best defocus of n particles from k features.
+
+    ``measured`` (n, k), ``noise`` (n, k, k); ``local`` (n, k, m): coefficients of each particle's curves;
+    ``grid`` (g,) m, equidistant, with ``basis`` and ``slope_basis`` (g, m): the polynomials there and
+    their derivatives per grid step; ``scatter`` (g, k, k). Between grid points basis and scatter are
+    interpolated (cubic Hermite, linear).
+    Returns defocus (n, 2) m, objective L (n, 2) and chi-square (n, 2); NaN where no second minimum is.
+    """
+    count, k = measured.shape
+    points = len(grid)
+    step = grid[1] - grid[0]
+    defocus = np.full((count, 2), np.nan)
+    objective = np.full((count, 2), np.nan)
+    chi_square = np.full((count, 2), np.nan)
+    curve = np.empty((points, k))
+    slope = np.empty((points, k))
+    level = np.empty(points)
+    residual = np.empty(k)
+    tangent = np.empty(k)
+    factor = np.empty((k, k))
+    for i in range(count):
+        for g in range(points):
+            for a in range(k):
+                value = 0.0
+                derivative = 0.0
+                for m in range(local.shape[2]):
+                    value += local[i, a, m] * basis[g, m]
+                    derivative += local[i, a, m] * slope_basis[g, m]
+                curve[g, a] = value
+                slope[g, a] = derivative
+                residual[a] = measured[i, a] - value
+                for b in range(a + 1):
+                    factor[a, b] = noise[i, a, b] + scatter[g, a, b]
+            log_det = _factorize(factor, k)
+            chi, _, _ = _products(factor, residual, tangent, k)
+            level[g] = chi + log_det
+        for g in range(points):
+            if (g > 0 and level[g] >= level[g - 1]) or (g < points - 1 and level[g] > level[g + 1]):
+                continue
+            low, high = max(g - 1.0, 0.0), min(g + 1.0, points - 1.0)
+            at = float(g)
+            chi = 0.0
+            log_det = 0.0
+            for iteration in range(_REFINEMENTS + 1):
+                left = min(int(at), points - 2)
+                t = at - left
+                for a in range(k):
+                    y0, y1, d0, d1 = curve[left, a], curve[left + 1, a], slope[left, a], slope[left + 1, a]
+                    c2 = 3 * (y1 - y0) - 2 * d0 - d1
+                    c3 = 2 * (y0 - y1) + d0 + d1
+                    residual[a] = measured[i, a] - (y0 + t * (d0 + t * (c2 + t * c3)))
+                    tangent[a] = d0 + t * (2 * c2 + 3 * t * c3)
+                    for b in range(a + 1):
+                        factor[a, b] = (
+                            noise[i, a, b] + (1 - t) * scatter[left, a, b] + t * scatter[left + 1, a, b]
+                        )
+                log_det = _factorize(factor, k)
+                chi, gain, information = _products(factor, residual, tangent, k)
+                if iteration == _REFINEMENTS or information <= 0:
+                    break
+                moved = min(max(at + gain / information, low), high)
+                if abs(moved - at) < 1e-6:
+                    break
+                at = moved
+            level_here = chi + log_det
+            slot = 2
+            if not level_here >= objective[i, 0]:
+                defocus[i, 1], objective[i, 1], chi_square[i, 1] = (
+                    defocus[i, 0],
+                    objective[i, 0],
+                    chi_square[i, 0],
+                )
+                slot = 0
+            elif not level_here >= objective[i, 1]:
+                slot = 1
+            if slot < 2:
+                defocus[i, slot] = grid[0] + at * step
+                objective[i, slot] = level_here
+                chi_square[i, slot] = chi
+    return defocus, objective, chi_square
+
+
+@njit(cache=True, nogil=True)
+def _factorize(matrix: Array, k: int) -> float:
+    """Cholesky factor in place (lower triangle); returns ln det."""
+    log_det = 0.0
+    for a in range(k):
+        for b in range(a + 1):
+            total = matrix[a, b]
+            for c in range(b):
+                total -= matrix[a, c] * matrix[b, c]
+            if a == b:
+                total = max(total, 1e-30)
+                log_det += np.log(total)
+                matrix[a, a] = np.sqrt(total)
+            else:
+                matrix[a, b] = total / matrix[b, b]
+    return log_det
+
+
+@njit(cache=True, nogil=True)
+def _products(factor: Array, residual: Array, tangent: Array, k: int) -> tuple[float, float, float]:
+    """r'C^-1 r, t'C^-1 r and t'C^-1 t from the Cholesky factor of C; overwrites r and t."""
+    chi = 0.0
+    gain = 0.0
+    information = 0.0
+    for a in range(k):
+        r = residual[a]
+        t = tangent[a]
+        for c in range(a):
+            r -= factor[a, c] * residual[c]
+            t -= factor[a, c] * tangent[c]
+        residual[a] = r / factor[a, a]
+        tangent[a] = t / factor[a, a]
+        chi += residual[a] * residual[a]
+        gain += tangent[a] * residual[a]
+        information += tangent[a] * tangent[a]
+    return chi, gain, information

@@ -1,0 +1,209 @@
+"""From focus stacks to a calibration: the whole procedure, with its refusals and warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mems6dof_ros import __version__
+from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.file import Calibration, ValidRange
+from mems6dof_ros.calibration.focus_stack import BeadStack, FocusStack, Rejection
+from mems6dof_ros.calibration.model_fit import GROUPS, BeadCurve, ModelFit, Orders, fit_model, sharpest_stage
+from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, features, field_position
+from mems6dof_ros.calibration.rho_amp import reference_map
+from mems6dof_ros.errors import InputError
+
+#: A bead whose curve departs from its neighbours' by this many times the usual scatter is left out.
+OUTLIER = 8.0
+#: Shapes do not depend on brightness; noise is in the covariance. Tested from 1/10 to 10 times.
+BRIGHTNESS_FACTOR = 30.0
+#: Below this number of beads the scatter between particles is poorly known.
+FEW_BEADS = 10
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """``axial_range`` m: largest |defocus| to model (all that the stacks cover). ``orders``: instead of
+    choosing them by cross-validation. ``rotations`` rad: the substrate's orientation in each stack."""
+
+    axial_range: float | None = None
+    orders: Orders | None = None
+    rotations: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """A ``calibration`` and how it came about: the ``fit``, the ``beads`` used with their curves, the
+    ``rejected`` ones, and ``warnings``, one sentence each."""
+
+    calibration: Calibration
+    fit: ModelFit
+    stacks: tuple[FocusStack, ...]
+    beads: tuple[BeadStack, ...]
+    curves: tuple[BeadCurve, ...]
+    rejected: tuple[Rejection, ...]
+    warnings: tuple[str, ...]
+
+
+def calibrate(
+    stacks: Sequence[FocusStack],
+    settings: CalibrationSettings | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> CalibrationResult:
+    """Calibrate the optics from one or several focus stacks of the same camera and fit.
+
+    Raises InputError where the stacks do not belong together, no bead is usable, or they leave no
+    common range through focus.
+    """
+    settings = settings or CalibrationSettings()
+    first = _check_alike(stacks, settings)
+    rejected = [replace(r, stack=index) for index, stack in enumerate(stacks) for r in stack.rejected]
+    beads = [(index, bead) for index, stack in enumerate(stacks) for bead in stack.beads]
+    if not beads:
+        reasons = "; ".join(sorted({r.reason for r in rejected})) or "nothing detected"
+        raise InputError("focus stack", f"no usable bead ({reasons})", "isolated beads through focus")
+    radius = float(np.hypot(*first.image_size)) / 2 * first.pixel_size
+    while True:
+        reference = reference_map([bead for _, bead in beads], radius, first.pixel_size, first.image_size)
+        curves = [_curve(bead, index, reference, first) for index, bead in beads]
+        interval = _interval(curves, settings.axial_range)
+        fit = fit_model(curves, reference, interval, settings.orders, settings.rotations, progress)
+        departure = _departures(fit)
+        outliers = departure > OUTLIER
+        if not outliers.any() or len(beads) < FEW_BEADS:
+            break
+        for (index, bead), ratio in zip(
+            [beads[k] for k in np.flatnonzero(outliers)], departure[outliers], strict=True
+        ):
+            x, y = bead.fits.parameters[bead.in_focus, :2]
+            rejected.append(
+                Rejection(x, y, f"departs from the field's curves by {ratio:.0f} times the scatter", index)
+            )
+        beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
+    chosen = [bead for _, bead in beads]
+    calibration = Calibration(
+        fit.model,
+        first.pixel_size,
+        first.image_size,
+        first.weighting,
+        first.window_px,
+        first.camera,
+        _valid_range(chosen, curves, interval, first),
+        provenance=_provenance(stacks, settings, fit, len(beads), len(rejected)),
+    )
+    warnings = _warnings(len(beads), fit)
+    return CalibrationResult(
+        calibration, fit, tuple(stacks), tuple(chosen), tuple(curves), tuple(rejected), tuple(warnings)
+    )
+
+
+def _check_alike(stacks: Sequence[FocusStack], settings: CalibrationSettings) -> FocusStack:
+    if not stacks:
+        raise InputError("calibration", "no focus stack", "at least one")
+    first = stacks[0]
+    for stack in stacks[1:]:
+        for name in ("pixel_size", "image_size", "weighting", "window_px"):
+            if getattr(stack, name) != getattr(first, name):
+                raise InputError(
+                    stack.description,
+                    f"{name} {getattr(stack, name)}",
+                    f"{getattr(first, name)} as in {first.description}",
+                )
+    if settings.rotations is not None and len(settings.rotations) != len(stacks):
+        raise InputError("rotations", f"{len(settings.rotations)} values", f"one per stack, {len(stacks)}")
+    return first
+
+
+def _curve(bead: BeadStack, stack: int, reference: FieldMap, first: FocusStack) -> BeadCurve:
+    x, y = field_position(bead.fits.parameters, first.pixel_size, first.image_size)
+    values, noise = features(bead.fits, first.pixel_size, reference(x, y))
+    values[:, 0], values[:, 1] = x, y
+    return BeadCurve(x[bead.in_focus], y[bead.in_focus], bead.stage_z, values, noise, stack)
+
+
+def _interval(curves: Sequence[BeadCurve], limit: float | None) -> tuple[float, float]:
+    """Defocus that at least 80 % of the beads cover, on either side."""
+    low, high = [], []
+    for curve in curves:
+        u = sharpest_stage(curve) - curve.stage_z
+        low.append(u.min())
+        high.append(u.max())
+    interval = (float(np.quantile(low, 0.8)), float(np.quantile(high, 0.2)))
+    if limit is not None:
+        interval = (max(interval[0], -limit), min(interval[1], limit))
+    if not interval[0] < 0 < interval[1]:
+        raise InputError("focus stacks", "beads in focus only at the ends", "planes on both sides of focus")
+    return interval
+
+
+def _departures(fit: ModelFit) -> Array:
+    """Mean square of each bead's held-out residuals over the median bead's, worst feature (b,)."""
+    square = np.array([np.mean(residual**2, axis=0) for residual in fit.residual])
+    kept = square[:, : FEATURES.index("rho_amp")]
+    return np.max(kept / np.maximum(np.median(kept, axis=0), 1e-30), axis=1)
+
+
+def _valid_range(
+    beads: Sequence[BeadStack], curves: Sequence[BeadCurve], interval: tuple[float, float], first: FocusStack
+) -> ValidRange:
+    """Half a bead distance beyond the outermost beads, inside the image; the whole image for few beads."""
+    half = [(n - 1) / 2 * first.pixel_size for n in first.image_size]
+    margin = np.inf if len(beads) < FEW_BEADS else np.sqrt(half[0] * half[1] / len(beads))
+    x, y = (
+        (max(-edge, min(values) - margin), min(edge, max(values) + margin))
+        for edge, values in zip(
+            half, ([curve.x for curve in curves], [curve.y for curve in curves]), strict=True
+        )
+    )
+    flux = [bead.flux for bead in beads]
+    return ValidRange(interval, x, y, (min(flux) / BRIGHTNESS_FACTOR, max(flux) * BRIGHTNESS_FACTOR))
+
+
+def _warnings(beads: int, fit: ModelFit) -> list[str]:
+    found = []
+    if beads == 1:
+        found.append("one bead: field dependence and the scatter between particles are unknown")
+    elif beads < FEW_BEADS:
+        found.append(f"only {beads} beads: the scatter between particles is poorly known")
+    return found
+
+
+def _provenance(
+    stacks: Sequence[FocusStack], settings: CalibrationSettings, fit: ModelFit, used: int, rejected: int
+) -> dict[str, Any]:
+    scores = {
+        name: {f"field {order}, degree {degree}": round(score, 4) for (order, degree), score in table.items()}
+        for name, table in fit.validation.curves.items()
+    }
+    middle = int(np.argmin(np.abs(fit.model.nodes)))
+    return {
+        "software": f"mems6dof_ros {__version__}",
+        "settings": {
+            "axial_range_m": settings.axial_range,
+            "orders": "cross-validation" if settings.orders is None else asdict(settings.orders),
+            "rotations_rad": None if settings.rotations is None else list(settings.rotations),
+        },
+        "inputs": [
+            {
+                "description": stack.description,
+                "sha256": stack.sha256,
+                "planes": len(stack.stage_z),
+                "stage_z_m": [float(stack.stage_z.min()), float(stack.stage_z.max())],
+                "beads": len(stack.beads),
+            }
+            for stack in stacks
+        ],
+        "beads_used": used,
+        "beads_rejected": rejected,
+        "orders": {name: [fit.orders.field[name], fit.orders.degree[name]] for name in GROUPS}
+        | {"focus_surface": fit.orders.focus},
+        "own_heights_rms_m": float(np.std(fit.own_height)),
+        "scatter_in_focus": {
+            name: float(np.sqrt(fit.model.scatter[middle, k, k])) for k, name in enumerate(FEATURES)
+        },
+        "cross_validation": scores,
+    }

@@ -1,0 +1,152 @@
+"""From fitted shapes to positions: the two methods differ only in the features they read.
+
+``rho_amp``, the paper's route, reads its one feature; ``joint`` reads both widths and the correlation.
+Both look up the same forward model with the same search, so an ambiguous or insensitive place of the
+field shows itself in the same way.
+
+The corrected lateral position is x_fit - dx(z). An error of z leaks dx/dz into it, and the scatter of
+real particles about the model is common to x, y and z: every position has its full 3 x 3 covariance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from mems6dof_ros.calibration.axial_search import search_defocus
+from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.interface import Positions
+from mems6dof_ros.calibration.optical_model import FEATURES, OpticalModel, features, field_position
+from mems6dof_ros.localization.localizations import Flag, GaussianFits
+
+#: Features that each method reads, as indices into FEATURES.
+METHODS = {
+    "rho_amp": (FEATURES.index("rho_amp"),),
+    "joint": tuple(FEATURES.index(name) for name in ("ln_sigma_x", "ln_sigma_y", "atanh_rho")),
+}
+
+#: A second z is a candidate while its L is worse by less than this: 4 sigma of a likelihood ratio.
+AMBIGUITY_GAP = 16.0
+#: Probability with which the shape of an undisturbed particle may exceed the limit of chi-square.
+MISFIT_PROBABILITY = 1e-5
+#: Sensitivity dz/dq is lost where z would have an uncertainty beyond this part of the range.
+BLIND_FRACTION = 0.25
+
+_GRID_STEP = 100e-9
+
+
+class Estimator:
+    """Positions of fitted particles from ``model`` by ``method``, valid for defocus in ``z_range`` (m)."""
+
+    def __init__(
+        self,
+        model: OpticalModel,
+        method: str,
+        z_range: tuple[float, float],
+        pixel_size: float,
+        image_size: tuple[int, int],
+    ) -> None:
+        self._model = model
+        self._used = np.array(METHODS[method])
+        self._z_range = z_range
+        self._pixel_size = pixel_size
+        self._image_size = image_size
+        low, high = model.curves.interval
+        steps = max(16, round((high - low) / _GRID_STEP))
+        self._grid = low + (high - low) / steps * np.arange(steps + 1, dtype=np.float64)
+        step = self._grid[1] - self._grid[0]
+        self._basis = model.curves.basis(self._grid)
+        terms = np.eye(model.curves.degree + 1)
+        slopes = chebyshev.chebder(terms, scl=2 * step / (high - low))
+        self._slope_basis: Array = np.ascontiguousarray(
+            chebyshev.chebval(model.curves.scaled(self._grid), slopes).T, dtype=np.float64
+        )
+        self._scatter = np.ascontiguousarray(
+            model.scatter_at(self._grid)[:, self._used[:, None], self._used[None, :]]
+        )
+        self._misfit = chi2.isf(MISFIT_PROBABILITY, max(len(self._used) - 1, 1))
+
+    def locate(self, fits: GaussianFits) -> Positions:
+        """Positions of ``fits`` (n); see :class:`~mems6dof_ros.calibration.interface.Positions`."""
+        count = len(fits)
+        position = np.full((count, 3), np.nan)
+        covariance = np.full((count, 3, 3), np.nan)
+        z_gap = np.full(count, np.nan)
+        flags = np.where(np.isfinite(fits.parameters).all(axis=1), 0, Flag.NO_Z).astype(np.uint32)
+        usable = np.flatnonzero(flags == 0)
+        if len(usable):
+            chosen = GaussianFits(
+                fits.parameters[usable],
+                fits.covariance[usable],
+                fits.chi_square[usable],
+                fits.iterations[usable],
+                fits.flags[usable],
+            )
+            position[usable], covariance[usable], z_gap[usable], flags[usable] = self._locate(chosen)
+        return Positions(position, covariance, z_gap, flags)
+
+    def _locate(self, fits: GaussianFits) -> tuple[Array, Array, Array, NDArray[np.uint32]]:
+        model, used = self._model, self._used
+        x, y = field_position(fits.parameters, self._pixel_size, self._image_size)
+        measured, noise = features(fits, self._pixel_size, model.reference(x, y))
+        measured[:, 0], measured[:, 1] = x, y
+        local = model.curves.local(x, y)
+        defocus, objective, chi_square = search_defocus(
+            measured[:, used],
+            noise[:, used[:, None], used[None, :]],
+            local[:, used],
+            self._grid,
+            self._basis,
+            self._slope_basis,
+            self._scatter,
+        )
+        best, second = defocus.T
+        focus = model.focus(x, y)
+        position, covariance = self._corrected(measured, noise, local, best, focus)
+        z_gap = objective[:, 1] - objective[:, 0]
+
+        sd_u = np.sqrt(covariance[:, 2, 2])
+        low, high = self._z_range
+        ambiguous = z_gap < AMBIGUITY_GAP
+        blind = ~(sd_u < BLIND_FRACTION * (high - low))
+        beyond = (best < low) | (best > high)
+        flags = np.where(ambiguous, Flag.Z_AMBIGUOUS, 0) | np.where(beyond, Flag.Z_OUT_OF_RANGE, 0)
+        flags |= np.where(chi_square[:, 0] > self._misfit, Flag.POOR_FIT, 0) | np.where(blind, Flag.NO_Z, 0)
+        covariance[ambiguous] = self._mixture(
+            position[ambiguous],
+            covariance[ambiguous],
+            self._corrected(*(a[ambiguous] for a in (measured, noise, local, second, focus))),
+            z_gap[ambiguous],
+        )
+        return position, covariance, z_gap, flags.astype(np.uint32)
+
+    def _corrected(
+        self, measured: Array, noise: Array, local: Array, u: Array, focus: Array
+    ) -> tuple[Array, Array]:
+        """Positions (n, 3) at defocus ``u`` with their covariance (n, 3, 3), linearised there."""
+        model, used = self._model, self._used
+        total = noise + model.scatter_at(u)
+        slope = model.curves.slopes(local, u)
+        values = model.curves.values(local, u)
+        tangent = slope[:, used]
+        weighted = np.linalg.solve(total[:, used[:, None], used[None, :]], tangent[:, :, None])[:, :, 0]
+        information = np.einsum("nk,nk->n", tangent, weighted)
+        gain = np.zeros((len(u), len(FEATURES)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain[:, used] = weighted / information[:, None]
+            jacobian = np.stack([-slope[:, :1] * gain, -slope[:, 1:2] * gain, gain], axis=1)
+            jacobian[:, 0, 0] += 1
+            jacobian[:, 1, 1] += 1
+            covariance = jacobian @ total @ jacobian.transpose(0, 2, 1)
+        covariance[:, 2, 2] += model.focus_variance
+        position = np.stack([measured[:, 0] - values[:, 0], measured[:, 1] - values[:, 1], u + focus], axis=1)
+        return position, covariance
+
+    def _mixture(self, position: Array, covariance: Array, other: tuple[Array, Array], gap: Array) -> Array:
+        """Second moment about ``position`` of two candidates whose L differ by ``gap``."""
+        weight = (1 / (1 + np.exp(gap / 2)))[:, None, None]
+        offset = other[0] - position
+        spread = other[1] + offset[:, :, None] * offset[:, None, :]
+        return (1 - weight) * covariance + weight * spread

@@ -1,0 +1,284 @@
+"""The calibration and its file: YAML text with format version, units, provenance and valid ranges.
+
+One file is all that localizing needs: the forward model, the fit that it was made with and must be used
+with, the camera's numbers. ``calibration_id`` is a hash of exactly that content, so that equal
+calibrations have equal names whoever wrote the file and when. A reader for every version ever written
+stays in ``_READERS``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from mems6dof_ros.calibration.estimator import METHODS, Estimator
+from mems6dof_ros.calibration.field_curves import Array, FieldCurves
+from mems6dof_ros.calibration.interface import Positions
+from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.localization.camera import CameraNoise
+from mems6dof_ros.localization.fitting import WEIGHTINGS
+from mems6dof_ros.localization.localizations import Flag, GaussianFits
+
+FORMAT = "mems6dof-calibration"
+VERSION = 1
+DEFAULT_METHOD = "joint"
+
+
+@dataclass(frozen=True)
+class ValidRange:
+    """Where the calibration holds: defocus ``z`` about the focus surface, field ``x`` and ``y`` (m), and
+    ``flux`` of the fitted Gaussian (electrons), each (lowest, highest)."""
+
+    z: tuple[float, float]
+    x: tuple[float, float]
+    y: tuple[float, float]
+    flux: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration of the optics; implements OpticalCalibration. ``method``: see estimator.METHODS.
+
+    ``provenance``: plain values for the file (software, settings, inputs, quality), not part of the id.
+    """
+
+    model: OpticalModel
+    pixel_size: float
+    image_size: tuple[int, int]
+    weighting: str
+    window_px: int
+    camera: CameraNoise
+    valid: ValidRange
+    method: str = DEFAULT_METHOD
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError("calibration method", repr(self.method), f"one of {', '.join(METHODS)}")
+
+    @cached_property
+    def calibration_id(self) -> str:
+        """First 16 hexadecimal digits of the SHA-256 of the content, method excluded."""
+        text = json.dumps(_content(self), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @cached_property
+    def _estimator(self) -> Estimator:
+        return Estimator(self.model, self.method, self.valid.z, self.pixel_size, self.image_size)
+
+    def locate(self, fits: GaussianFits) -> Positions:
+        """Positions of ``fits``; failed fits give NaN, values beyond the valid range are flagged."""
+        found = self._estimator.locate(fits)
+        x, y = field_position(fits.parameters, self.pixel_size, self.image_size)
+        with np.errstate(invalid="ignore"):
+            outside = _outside(x, self.valid.x) | _outside(y, self.valid.y)
+            brightness = _outside(fits.flux, self.valid.flux)
+        flags = np.where(outside, Flag.OUT_OF_FIELD, 0) | np.where(brightness, Flag.OUT_OF_BRIGHTNESS, 0)
+        return replace(found, flags=found.flags | flags.astype(np.uint32))
+
+    def with_method(self, method: str) -> Calibration:
+        """The same calibration read by another ``method``; InputError for an unknown one."""
+        return replace(self, method=method)
+
+
+def _outside(value: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+    return (value < limits[0]) | (value > limits[1])
+
+
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
+    """Write ``calibration`` to ``path``: completed under another name first, so never half-written."""
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "calibration_id": calibration.calibration_id,
+        "method": calibration.method,
+        "provenance": dict(calibration.provenance),
+        **_content(calibration),
+    }
+    text = _HEADER + yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110)
+    path = Path(path)
+    unfinished = path.with_name(path.name + ".part")
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a file that can be written") from None
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def load_calibration(path: str | Path, method: str | None = None) -> Calibration:
+    """Read a calibration file; ``method`` replaces the file's own choice.
+
+    Raises InputError for a missing or malformed file, another format, a version from the future, and
+    content that does not match its own calibration_id.
+    """
+    where = str(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        found = error.strerror if isinstance(error, OSError) and error.strerror else "no text"
+        raise InputError(where, found, "a calibration file made by 'mems6dof calibrate'") from None
+    try:
+        document = yaml.load(text, Loader=_Loader)
+    except yaml.YAMLError as error:
+        raise InputError(where, f"no YAML ({str(error).splitlines()[0]})", "a calibration file") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError(where, "no calibration", f"a file with 'format: {FORMAT}'")
+    version = document.get("version")
+    if version not in _READERS:
+        raise InputError(f"{where}: version", repr(version), f"one of {', '.join(map(str, _READERS))}")
+    calibration = _READERS[version](_Fields(document, where))
+    stated = document.get("calibration_id")
+    if stated != calibration.calibration_id:
+        raise InputError(
+            f"{where}: calibration_id", repr(stated), f"{calibration.calibration_id}: the content was changed"
+        )
+    return calibration.with_method(method) if method else calibration
+
+
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+_HEADER = """\
+# Calibration of the optics: what the Gaussian fit sees of a particle at (X, Y, z). Units are in the
+# names; features are, in this order, dx and dy (m), ln(sigma_x/px), ln(sigma_y/px), atanh(rho), rho_amp.
+# Curves: sum over j, m of coefficients[feature][j][m] Z_j(X/R, Y/R) T_m(u scaled to -1..1), Z Zernike in
+# OSA/ANSI order with unit rms, T Chebyshev, R disc_radius_m, u = z - focus_surface(X, Y).
+"""
+
+
+def _content(calibration: Calibration) -> dict[str, Any]:
+    """Everything that determines positions, as plain values: the body of a version-1 file."""
+    model, camera, valid = calibration.model, calibration.camera, calibration.valid
+    return {
+        "optics": {
+            "pixel_size_m": float(calibration.pixel_size),
+            "image_size_px": [int(n) for n in calibration.image_size],
+        },
+        "camera": {
+            "offset_adu": _mean(camera.offset_adu),
+            "gain_adu_per_electron": _mean(camera.gain_adu_per_electron),
+            "read_noise_electrons": _mean(camera.read_noise_electrons),
+            "saturation_adu": float(camera.saturation_adu),
+        },
+        "fit": {"weighting": calibration.weighting, "window_px": int(calibration.window_px)},
+        "valid": {
+            "defocus_m": [float(v) for v in valid.z],
+            "x_m": [float(v) for v in valid.x],
+            "y_m": [float(v) for v in valid.y],
+            "flux_electrons": [float(v) for v in valid.flux],
+        },
+        "model": {
+            "disc_radius_m": float(model.curves.radius),
+            "defocus_interval_m": [float(v) for v in model.curves.interval],
+            "features": list(FEATURES),
+            "coefficients": model.curves.coefficients.tolist(),
+            "focus_surface_m": model.focus.coefficients.tolist(),
+            "focus_variance_m2": float(model.focus_variance),
+            "ln_reference_amplitude_per_flux": model.reference.coefficients.tolist(),
+            "scatter_defocus_m": model.nodes.tolist(),
+            "scatter_covariance": model.scatter.tolist(),
+        },
+    }
+
+
+def _mean(value: Any) -> float:
+    return float(np.mean(value))
+
+
+class _Fields:
+    """Reads checked values from a document, naming the field in every complaint."""
+
+    def __init__(self, values: Any, where: str) -> None:
+        if not isinstance(values, dict):
+            raise InputError(where, type(values).__name__, "named values")
+        self._values, self._where = values, where
+
+    def __call__(self, name: str) -> Any:
+        if name not in self._values:
+            raise InputError(f"{self._where}: {name}", "nothing", "a value")
+        return self._values[name]
+
+    def section(self, name: str) -> _Fields:
+        return _Fields(self(name), f"{self._where}: {name}")
+
+    def array(self, name: str, *shape: int) -> Array:
+        """Finite numbers of ``shape``; -1 stands for any length."""
+        try:
+            array = np.array(self(name), dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.empty(0)
+        fits = array.ndim == len(shape) and all(
+            want in (-1, got) for want, got in zip(shape, array.shape, strict=True)
+        )
+        if not fits or array.size == 0 or not np.isfinite(array).all():
+            raise InputError(f"{self._where}: {name}", "something else", f"finite numbers of shape {shape}")
+        return array
+
+    def number(self, name: str) -> float:
+        return float(self.array(name))
+
+    def interval(self, name: str) -> tuple[float, float]:
+        low, high = self.array(name, 2)
+        if not low < high:
+            raise InputError(f"{self._where}: {name}", f"{low} to {high}", "lowest, then highest")
+        return float(low), float(high)
+
+
+def _read_version_1(fields: _Fields) -> Calibration:
+    optics, camera, fit = (fields.section(name) for name in ("optics", "camera", "fit"))
+    valid, model = fields.section("valid"), fields.section("model")
+    weighting = fit("weighting")
+    if weighting not in WEIGHTINGS:
+        raise InputError("calibration: fit: weighting", repr(weighting), f"one of {', '.join(WEIGHTINGS)}")
+    if model("features") != list(FEATURES):
+        raise InputError("calibration: model: features", repr(model("features")), repr(list(FEATURES)))
+    radius = model.number("disc_radius_m")
+    nodes = model.array("scatter_defocus_m", -1)
+    width, height = optics.array("image_size_px", 2)
+    count = len(FEATURES)
+    return Calibration(
+        OpticalModel(
+            FieldCurves(
+                radius, model.interval("defocus_interval_m"), model.array("coefficients", count, -1, -1)
+            ),
+            FieldMap(radius, model.array("focus_surface_m", -1)),
+            FieldMap(radius, model.array("ln_reference_amplitude_per_flux", -1)),
+            nodes,
+            model.array("scatter_covariance", len(nodes), count, count),
+            model.number("focus_variance_m2"),
+        ),
+        pixel_size=optics.number("pixel_size_m"),
+        image_size=(int(width), int(height)),
+        weighting=weighting,
+        window_px=int(fit.number("window_px")),
+        camera=CameraNoise(
+            camera.number("offset_adu"),
+            camera.number("gain_adu_per_electron"),
+            camera.number("read_noise_electrons"),
+            camera.number("saturation_adu"),
+        ),
+        valid=ValidRange(
+            valid.interval("defocus_m"),
+            valid.interval("x_m"),
+            valid.interval("y_m"),
+            valid.interval("flux_electrons"),
+        ),
+        method=fields("method"),
+        provenance=fields("provenance"),
+    )
+
+
+_READERS = {1: _read_version_1}

@@ -1,0 +1,261 @@
+"""Focus stacks: frames at known stage positions to one curve of Gaussian fits per bead."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import Frame
+from mems6dof_ros.localization.camera import CameraNoise
+from mems6dof_ros.localization.detection import detect
+from mems6dof_ros.localization.fitting import fit_gaussians
+from mems6dof_ros.localization.localizations import Flag, GaussianFits
+
+#: Called as progress(done, total) after every plane. Raising from it cancels; nothing has been written.
+Progress = Callable[[int, int], None]
+
+LEAST_PLANES = 8
+#: Beads nearer to each other than this part of the window disturb each other when out of focus.
+_NEIGHBOUR = 0.75
+#: A bead must be fitted in this part of the planes, in one run through its focus.
+_LEAST_RUN = 0.6
+#: Brighter or dimmer than the median bead by this factor: a clump, or debris.
+_BRIGHTNESS_FACTOR = 3.0
+#: Planes in which beads are looked for, spread over the sharpest part of the stack.
+_SEED_PLANES = 7
+
+
+@dataclass(frozen=True)
+class BeadStack:
+    """One bead through focus: ``stage_z`` (n,) m in the order of the planes, with its ``fits`` (n)."""
+
+    stage_z: Array
+    fits: GaussianFits
+
+    @property
+    def in_focus(self) -> int:
+        """Index of the plane with the least sigma_x sigma_y."""
+        return int(np.argmin(self.fits.parameters[:, 3] * self.fits.parameters[:, 4]))
+
+    @property
+    def flux(self) -> float:
+        """Electrons of the Gaussian in focus."""
+        return float(self.fits.flux[self.in_focus])
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A bead that was not used: where (px, of the image) and why. ``stack``: index of its stack."""
+
+    x_px: float
+    y_px: float
+    reason: str
+    stack: int = 0
+
+
+@dataclass(frozen=True)
+class FocusStack:
+    """The beads of one stack and what they were measured with; ``stage_z`` (planes,) m.
+
+    ``sha256`` identifies the pixels and stage positions; ``description`` says where they came from.
+    """
+
+    beads: tuple[BeadStack, ...]
+    rejected: tuple[Rejection, ...]
+    stage_z: Array
+    pixel_size: float
+    image_size: tuple[int, int]
+    camera: CameraNoise
+    weighting: str
+    window_px: int
+    description: str
+    sha256: str
+
+
+def measure_stack(
+    frames: Iterable[Frame],
+    camera: CameraNoise,
+    weighting: str,
+    window_px: int,
+    description: str = "",
+    progress: Progress = lambda done, total: None,
+) -> FocusStack:
+    """Fit every bead in every plane of a focus stack.
+
+    All frames are held in memory (8.4 MB each at 2048 x 2048), since beads are looked for in the
+    sharpest planes first. Raises InputError for planes without stage position or pixel size, of
+    differing size, too few of them, or without a usable bead.
+    """
+    planes = list(frames)
+    stage_z, pixel_size, image_size = _check_planes(planes, description or "focus stack")
+    seeds = _find_beads(planes, window_px)
+    fits = _track(planes, seeds, camera, weighting, window_px, progress)
+    beads, rejected = _select(fits, seeds, stage_z, window_px)
+    return FocusStack(
+        beads,
+        rejected,
+        stage_z,
+        pixel_size,
+        image_size,
+        camera,
+        weighting,
+        window_px,
+        description,
+        _digest(planes, stage_z),
+    )
+
+
+def _check_planes(planes: Sequence[Frame], where: str) -> tuple[Array, float, tuple[int, int]]:
+    stage_z = np.array([plane.stage_z for plane in planes])
+    if len(np.unique(stage_z)) < LEAST_PLANES:
+        raise InputError(
+            where,
+            f"{len(np.unique(stage_z))} stage positions",
+            f"at least {LEAST_PLANES} planes through focus",
+        )
+    if not np.isfinite(stage_z).all():
+        first = int(np.flatnonzero(~np.isfinite(stage_z))[0])
+        raise InputError(
+            where, f"plane {first} without a stage position", "stage_z of every plane, or a step"
+        )
+    shapes = {plane.image.shape for plane in planes}
+    if len(shapes) > 1:
+        raise InputError(where, f"images of sizes {sorted(shapes)}", "one size")
+    pixel_size = planes[0].pixel_size
+    if not pixel_size > 0:
+        raise InputError(where, f"pixel size {pixel_size}", "the pixel size in object space, m")
+    height, width = planes[0].image.shape
+    return stage_z, pixel_size, (width, height)
+
+
+def _digest(planes: Sequence[Frame], stage_z: Array) -> str:
+    digest = hashlib.sha256(np.ascontiguousarray(stage_z).tobytes())
+    for plane in planes:
+        digest.update(np.ascontiguousarray(plane.image).tobytes())
+    return digest.hexdigest()
+
+
+def _find_beads(planes: Sequence[Frame], window_px: int) -> Array:
+    """Positions (n, 2) px of everything detected in a few planes about the sharpest one.
+
+    Tilt and curvature put beads into focus at different planes, hence several of them.
+    """
+    sharpness = [float(np.var(np.diff(plane.image[::2].astype(np.float32), axis=1))) for plane in planes]
+    bright = np.flatnonzero(np.array(sharpness) >= 0.5 * (max(sharpness) + min(sharpness)))
+    chosen = np.unique(bright[np.linspace(0, len(bright) - 1, _SEED_PLANES).round().astype(int)])
+    seeds = np.empty((0, 2))
+    for index in [int(np.argmax(sharpness)), *chosen]:
+        found = detect(planes[index].image)
+        if len(seeds) and len(found):
+            distance, _ = cKDTree(seeds).query(found)
+            found = found[distance > window_px / 4]
+        seeds = np.vstack([seeds, found])
+    return seeds
+
+
+def _track(
+    planes: Sequence[Frame],
+    seeds: Array,
+    camera: CameraNoise,
+    weighting: str,
+    window_px: int,
+    progress: Progress,
+) -> list[GaussianFits]:
+    """Fits of all seeds in every plane, from the sharpest plane outwards, so that a bead's last good
+    position starts the next fit."""
+    order = np.argsort([plane.stage_z for plane in planes], kind="stable")
+    contrast = [float(np.var(planes[index].image[::4, ::4].astype(np.float32))) for index in order]
+    start = int(np.argmax(contrast))
+    fits: list[GaussianFits | None] = [None] * len(planes)
+    done = 0
+    middle = seeds
+    for direction in (range(start, len(order)), range(start - 1, -1, -1)):
+        positions = middle
+        for index in (order[k] for k in direction):
+            found = fit_gaussians(planes[index].image, positions, camera, weighting, window_px)
+            fits[index] = found
+            near = np.hypot(*(found.parameters[:, :2] - positions).T) < window_px / 4
+            positions = np.where(near[:, None], found.parameters[:, :2], positions)
+            if index == order[start]:
+                middle = positions
+            done += 1
+            progress(done, len(planes))
+    return [found for found in fits if found is not None]
+
+
+def _select(
+    fits: Sequence[GaussianFits], seeds: Array, stage_z: Array, window_px: int
+) -> tuple[tuple[BeadStack, ...], tuple[Rejection, ...]]:
+    parameters = np.array([found.parameters for found in fits])
+    flags = np.array([found.flags for found in fits])
+    order = np.argsort(stage_z, kind="stable")
+    crowd = cKDTree(seeds).query(seeds, k=2)[0][:, 1] if len(seeds) > 1 else np.full(len(seeds), np.inf)
+    beads, places, rejected = [], [], []
+    for number, seed in enumerate(seeds):
+        good = (flags[order, number] & (Flag.FIT_FAILED | Flag.WINDOW_CUT)) == 0
+        run = _run_through_focus(parameters[order, number], good)
+        used = order[run]
+        if (flags[:, number] & Flag.WINDOW_CUT).any():
+            reason = "its window leaves the image"
+        elif crowd[number] < _NEIGHBOUR * window_px:
+            reason = f"overlaps: another particle at {crowd[number]:.0f} px"
+        elif len(used) < _LEAST_RUN * len(stage_z):
+            reason = f"unfittable: fitted in {len(used)} of {len(stage_z)} planes in a row"
+        elif (flags[used, number] & Flag.SATURATED).any():
+            reason = f"saturated in {np.count_nonzero(flags[used, number] & Flag.SATURATED)} planes"
+        else:
+            bead = _bead(fits, used, number, stage_z)
+            if 1 < bead.in_focus < len(used) - 2:
+                beads.append(bead)
+                places.append(seed)
+                continue
+            reason = "its focus is not inside the stack"
+        rejected.append(Rejection(float(seed[0]), float(seed[1]), reason))
+    flux = np.array([bead.flux for bead in beads])
+    keep = []
+    for bead, place, ratio in zip(beads, places, flux / np.median(flux) if len(flux) else flux, strict=True):
+        if 1 / _BRIGHTNESS_FACTOR < ratio < _BRIGHTNESS_FACTOR:
+            keep.append(bead)
+        else:
+            rejected.append(
+                Rejection(
+                    float(place[0]),
+                    float(place[1]),
+                    f"{ratio:.2g} times the median brightness: a clump or debris",
+                )
+            )
+    return tuple(keep), tuple(rejected)
+
+
+def _run_through_focus(parameters: Array, good: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Indices of the unbroken run of ``good`` planes about the smallest image."""
+    if not good.any():
+        return np.empty(0, dtype=np.intp)
+    size = np.where(good, parameters[:, 3] * parameters[:, 4], np.inf)
+    # An amplitude lost in the background may be fitted by any small Gaussian: brightest counts.
+    focus = int(np.argmax(np.where(good, parameters[:, 2], -np.inf))) if np.isfinite(size).any() else 0
+    bad = np.flatnonzero(~good)
+    first = bad[bad < focus].max(initial=-1) + 1
+    last = bad[bad > focus].min(initial=len(good))
+    return np.arange(first, last)
+
+
+def _bead(fits: Sequence[GaussianFits], used: NDArray[np.intp], number: int, stage_z: Array) -> BeadStack:
+    chosen = [fits[index] for index in used]
+    return BeadStack(
+        stage_z[used],
+        GaussianFits(
+            np.array([f.parameters[number] for f in chosen]),
+            np.array([f.covariance[number] for f in chosen]),
+            np.array([f.chi_square[number] for f in chosen]),
+            np.array([f.iterations[number] for f in chosen]),
+            np.array([f.flags[number] for f in chosen]),
+        ),
+    )

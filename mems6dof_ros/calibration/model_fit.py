@@ -1,0 +1,392 @@
+"""Bead curves to the forward model: heights, focus surface, curves over the field, scatter, orders.
+
+Every bead sits at its own unknown height and place. Its stage position of sharpest image S defines its
+defocus u = S - stage_z; S is refined until the bead's curve agrees with its neighbours'. Then
+
+    S_b = p_s + t_s . (X, Y)_b - f(X_b, Y_b) + own height of bead b
+
+separates field curvature f from the substrate's tilt t where stacks of one substrate, turned between
+them, are fitted together; in a single stack the tilt belongs to f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mems6dof_ros.calibration.field_curves import Array, BeadSamples, FieldCurves, FieldRegression
+from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel
+from mems6dof_ros.calibration.zernike import zernike, zernike_count
+
+#: Groups of features that may need different orders, as slices of FEATURES.
+GROUPS = {"lateral": slice(0, 2), "shape": slice(2, 5), "rho_amp": slice(5, 6)}
+#: Orders that cross-validation chooses from.
+FIELD_ORDERS = (0, 1, 2, 3, 4, 5)
+DEGREES = (6, 8, 10, 12, 14, 16)
+FOCUS_ORDERS = (0, 1, 2, 3, 4)
+
+_FOLDS = 10
+_NODES = 41
+_ROUNDS = 3
+#: Of orders whose scores agree within this factor the fewest coefficients are taken.
+_AS_GOOD = 1.01
+#: Scatter assumed before it is known, as standard deviations of FEATURES: of the order of real beads'.
+_FIRST_SCATTER = np.diag(np.array([5e-9, 5e-9, 0.02, 0.02, 0.02, 0.02]) ** 2)
+
+
+@dataclass(frozen=True)
+class BeadCurve:
+    """One bead through focus: field position ``x``, ``y`` (m), ``stage_z`` (n,) m, ``features`` (n, 6) in
+    the order of FEATURES with ``noise`` (n, 6, 6); dx, dy are here field coordinates of the fitted
+    image in m. ``stack``: index of its focus stack."""
+
+    x: float
+    y: float
+    stage_z: Array
+    features: Array
+    noise: Array
+    stack: int = 0
+
+
+@dataclass(frozen=True)
+class Orders:
+    """Zernike ``field`` order and Chebyshev ``degree`` of each of GROUPS; ``focus`` order of the surface."""
+
+    field: dict[str, int]
+    degree: dict[str, int]
+    focus: int
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Held-out scores. ``curves[group][field order, degree]``: mean squared residual over its variance;
+    ``focus[order]``: rms in m. Empty where there are too few beads to leave one out."""
+
+    curves: dict[str, dict[tuple[int, int], float]]
+    focus: dict[int, float]
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """The fitted ``model`` with what tells how good it is.
+
+    Per bead: ``sharpest`` (b,) m, stage position of sharpest image; ``own_height`` (b,) m, about
+    substrate and focus surface; ``defocus`` and held-out ``residual``: lists of (n,) m and (n, 6).
+    """
+
+    model: OpticalModel
+    orders: Orders
+    validation: CrossValidation
+    sharpest: Array
+    own_height: Array
+    defocus: list[Array]
+    residual: list[Array]
+
+
+def fit_model(
+    beads: Sequence[BeadCurve],
+    reference: FieldMap,
+    interval: tuple[float, float],
+    orders: Orders | None = None,
+    rotations: Sequence[float] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> ModelFit:
+    """Fit the forward model to ``beads`` over the defocus ``interval`` (m).
+
+    ``reference``: ln of reference amplitude over flux, with which the beads' rho_amp was formed.
+    ``orders``: taken as given, else chosen by cross-validation over whole beads. ``rotations``: rad, the
+    substrate's orientation in each stack, to separate its tilt from the focus surface.
+    """
+    alignment = _Alignment(beads, reference.radius, interval)
+    first = Orders(
+        dict.fromkeys(GROUPS, min(2, _affordable_order(len(beads)))),
+        dict.fromkeys(GROUPS, min(10, _affordable_degree(beads, interval))),
+        0,
+    )
+    current, validation = first, CrossValidation({}, {})
+    nodes = np.linspace(*interval, _NODES)
+    scatter = np.repeat(_FIRST_SCATTER[None], _NODES, axis=0)
+    for number in range(_ROUNDS + 1):
+        progress(f"fit {number + 1} of {_ROUNDS + 1}")
+        alignment.scatter = (nodes, scatter)
+        regression = alignment.regression(_highest(beads, interval, orders))
+        if number > 0 and orders is not None:
+            current = orders
+        elif number in (1, _ROUNDS) and len(beads) >= 3:
+            validation = _cross_validate(regression, alignment, interval)
+            current = _best(validation)
+        curves = _fit(regression, current)
+        residual = _held_out(regression, alignment, current)
+        scatter = _scatter(alignment, residual, nodes)
+        if number < _ROUNDS:
+            alignment.align(curves)
+    focus_scores, focus_order = _choose_focus_order(beads, alignment.sharpest, reference.radius, rotations)
+    if orders is not None:
+        focus_order = orders.focus
+    focus, own_height, focus_variance = _focus_surface(
+        beads, alignment.sharpest, reference.radius, focus_order, rotations
+    )
+    return ModelFit(
+        OpticalModel(curves, focus, reference, nodes, scatter, focus_variance),
+        Orders(current.field, current.degree, focus_order),
+        CrossValidation(validation.curves, focus_scores),
+        alignment.sharpest,
+        own_height,
+        [sample.argument for sample in alignment.samples()],
+        residual,
+    )
+
+
+def sharpest_stage(bead: BeadCurve) -> float:
+    """Stage position (m) where sigma_x sigma_y is least: vertex of a parabola about the minimum."""
+    size = bead.features[:, 2] + bead.features[:, 3]
+    centre = bead.stage_z[int(np.argmin(size))]
+    reach = max(1e-6, 2.1 * float(np.median(np.abs(np.diff(bead.stage_z)))))
+    near = np.abs(bead.stage_z - centre) <= reach
+    if near.sum() < 4:
+        return float(centre)
+    a, b, _ = np.polyfit((bead.stage_z[near] - centre) / reach, size[near], 2)
+    vertex = -b / (2 * a) if a > 0 else 0.0
+    return float(centre + reach * np.clip(vertex, -1, 1))
+
+
+def merge_curves(parts: dict[str, FieldCurves]) -> FieldCurves:
+    """One FieldCurves from one per group, padded with zeros to the highest orders."""
+    shape = np.max([part.coefficients.shape for part in parts.values()], axis=0)
+    coefficients = np.zeros((len(FEATURES), shape[1], shape[2]))
+    for name, part in parts.items():
+        _, j, m = part.coefficients.shape
+        coefficients[GROUPS[name], :j, :m] = part.coefficients[GROUPS[name]]
+    some = next(iter(parts.values()))
+    return FieldCurves(some.radius, some.interval, coefficients)
+
+
+class _Alignment:
+    """Every bead's stage position of sharpest image and lateral place, refined against the model."""
+
+    def __init__(self, beads: Sequence[BeadCurve], radius: float, interval: tuple[float, float]) -> None:
+        self._beads = beads
+        self._radius = radius
+        self._interval = interval
+        self.sharpest = np.array([sharpest_stage(bead) for bead in beads])
+        self.place = np.array(
+            [
+                [np.interp(0, *_ascending(s - bead.stage_z, bead.features[:, k])) for k in (0, 1)]
+                for bead, s in zip(beads, self.sharpest, strict=True)
+            ]
+        )
+        self.scatter: tuple[Array, Array]
+
+    def samples(self) -> list[BeadSamples]:
+        """The beads' curves about their present heights and places, within the interval."""
+        found = []
+        for bead, sharpest, place in zip(self._beads, self.sharpest, self.place, strict=True):
+            u = sharpest - bead.stage_z
+            inside = (u >= self._interval[0]) & (u <= self._interval[1])
+            values = bead.features[inside].copy()
+            values[:, :2] -= place
+            variance = np.einsum("nkk->nk", self.covariance(bead, u, inside))
+            found.append(BeadSamples(bead.x, bead.y, u[inside], values, 1 / variance))
+        return found
+
+    def covariance(self, bead: BeadCurve, u: Array, inside: NDArray[np.bool_]) -> Array:
+        """Fit noise and scatter of the planes ``inside`` at defocus ``u``: (n, 6, 6)."""
+        nodes, scatter = self.scatter
+        nearest = np.clip(np.rint((u - nodes[0]) / (nodes[1] - nodes[0])), 0, len(nodes) - 1).astype(np.intp)
+        return bead.noise[inside] + scatter[nearest[inside]]
+
+    def noise(self) -> list[Array]:
+        """Fit noise of the planes that ``samples`` has."""
+        return [
+            bead.noise[(s - bead.stage_z >= self._interval[0]) & (s - bead.stage_z <= self._interval[1])]
+            for bead, s in zip(self._beads, self.sharpest, strict=True)
+        ]
+
+    def regression(self, highest: tuple[int, int]) -> FieldRegression:
+        return FieldRegression(self.samples(), self._radius, self._interval, *highest)
+
+    def align(self, curves: FieldCurves) -> None:
+        """One Gauss-Newton step of every bead's height, then of its lateral place."""
+        shape = GROUPS["shape"]
+        shift = np.zeros(len(self._beads))
+        for number, (bead, sample) in enumerate(zip(self._beads, self.samples(), strict=True)):
+            u = self.sharpest[number] - bead.stage_z
+            inside = (u >= self._interval[0]) & (u <= self._interval[1])
+            covariance = self.covariance(bead, u, inside)
+            local = np.repeat(
+                curves.local(np.array([bead.x]), np.array([bead.y])), len(sample.argument), axis=0
+            )
+            residual = sample.values - curves.values(local, sample.argument)
+            slope = curves.slopes(local, sample.argument)
+            weighted = np.linalg.solve(covariance[:, shape, shape], slope[:, shape, None])[:, :, 0]
+            shift[number] = np.sum(weighted * residual[:, shape]) / np.sum(weighted * slope[:, shape])
+            weight = sample.weights[:, :2]
+            self.place[number] += np.sum(weight * residual[:, :2], axis=0) / np.sum(weight, axis=0)
+        # The mean shift is the choice of origin, which stays.
+        self.sharpest += np.clip(shift - np.mean(shift), -0.5e-6, 0.5e-6)
+
+
+def _ascending(x: Array, y: Array) -> tuple[Array, Array]:
+    order = np.argsort(x)
+    return x[order], y[order]
+
+
+def _affordable_order(beads: int) -> int:
+    """Highest Zernike order with no more terms than half the beads."""
+    return max([order for order in FIELD_ORDERS if zernike_count(order) <= beads / 2], default=0)
+
+
+def _affordable_degree(beads: Sequence[BeadCurve], interval: tuple[float, float]) -> int:
+    """Highest degree with at least two planes to a term."""
+    step = min(float(np.median(np.abs(np.diff(bead.stage_z)))) for bead in beads)
+    return max(DEGREES[0], min(DEGREES[-1], int((interval[1] - interval[0]) / step / 2) - 1))
+
+
+def _highest(
+    beads: Sequence[BeadCurve], interval: tuple[float, float], orders: Orders | None
+) -> tuple[int, int]:
+    field, degree = _affordable_order(len(beads)), _affordable_degree(beads, interval)
+    if orders is not None:
+        field, degree = max(field, *orders.field.values()), max(degree, *orders.degree.values())
+    return field, degree
+
+
+def _fit(regression: FieldRegression, orders: Orders, use: NDArray[np.bool_] | None = None) -> FieldCurves:
+    """Curves of all groups; dx and dy made zero in focus, where a bead's place is defined."""
+    curves = merge_curves(
+        {name: regression.fit(orders.field[name], orders.degree[name], use) for name in GROUPS}
+    )
+    in_focus = curves.coefficients[:2] @ curves.basis(np.zeros(1))[0]
+    curves.coefficients[:2, :, 0] -= in_focus
+    return curves
+
+
+def _folds(count: int) -> list[NDArray[np.bool_]]:
+    """Masks of the beads left out together; the beads' order is arbitrary, so every k-th goes."""
+    folds = min(count, _FOLDS)
+    return [np.arange(count) % folds == fold for fold in range(folds)]
+
+
+def _held_out(regression: FieldRegression, alignment: _Alignment, orders: Orders) -> list[Array]:
+    """Residual (n, 6) of every bead from the curves fitted without it (with it, where it is alone)."""
+    samples = alignment.samples()
+    residual: list[Array] = [np.empty(0)] * len(samples)
+    for left_out in _folds(len(samples)):
+        curves = _fit(regression, orders, None if len(samples) == 1 else ~left_out)
+        for index in np.flatnonzero(left_out):
+            residual[index] = _residual(samples[index], curves)
+    return residual
+
+
+def _residual(sample: BeadSamples, curves: FieldCurves) -> Array:
+    local = curves.local(np.array([sample.x]), np.array([sample.y]))[0]
+    return sample.values - curves.basis(sample.argument) @ local.T
+
+
+def _cross_validate(
+    regression: FieldRegression, alignment: _Alignment, interval: tuple[float, float]
+) -> CrossValidation:
+    samples = alignment.samples()
+    beads = alignment._beads
+    scores: dict[str, dict[tuple[int, int], float]] = {name: {} for name in GROUPS}
+    field_orders = [order for order in FIELD_ORDERS if order <= _affordable_order(len(beads))]
+    degrees = [degree for degree in DEGREES if degree <= _affordable_degree(beads, interval)]
+    folds = _folds(len(samples))
+    for field_order in field_orders:
+        for degree in degrees:
+            total, count = np.zeros(len(FEATURES)), 0
+            for left_out in folds:
+                curves = regression.fit(field_order, degree, ~left_out)
+                for index in np.flatnonzero(left_out):
+                    sample = samples[index]
+                    total += np.sum(_residual(sample, curves) ** 2 * sample.weights, axis=0)
+                    count += len(sample.argument)
+            for name, group in GROUPS.items():
+                scores[name][field_order, degree] = float(np.mean(total[group]) / count)
+    return CrossValidation(scores, {})
+
+
+def _best(validation: CrossValidation) -> Orders:
+    chosen = {}
+    for name, scores in validation.curves.items():
+        good = [key for key in scores if scores[key] <= _AS_GOOD * min(scores.values())]
+        chosen[name] = min(good, key=lambda key: zernike_count(key[0]) * (key[1] + 1))
+    return Orders(
+        {name: order for name, (order, _) in chosen.items()},
+        {name: degree for name, (_, degree) in chosen.items()},
+        0,
+    )
+
+
+def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Array:
+    """Covariance (g, 6, 6) of the beads about the curves near each node, fit noise taken off."""
+    u = np.concatenate([sample.argument for sample in alignment.samples()])
+    r = np.concatenate(residual)
+    noise = np.concatenate(alignment.noise())
+    spacing = nodes[1] - nodes[0]
+    found = np.empty((len(nodes), len(FEATURES), len(FEATURES)))
+    for index, node in enumerate(nodes):
+        weight = np.clip(1.5 - np.abs(u - node) / spacing, 0, None)
+        excess = r[:, :, None] * r[:, None, :] - noise
+        found[index] = _positive(np.einsum("n,nkl->kl", weight, excess) / max(weight.sum(), 1e-12))
+    return found
+
+
+def _positive(matrix: Array) -> Array:
+    """The nearest positive semidefinite matrix, in units in which the diagonal is 1."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-24))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return (vectors * np.maximum(values, 1e-6)) @ vectors.T * np.outer(scale, scale)
+
+
+def _focus_design(
+    beads: Sequence[BeadCurve], radius: float, order: int, rotations: Sequence[float] | None
+) -> tuple[Array, int]:
+    """Design matrix of S: one level per stack, then the substrate's tilt if separable, then -f without
+    its piston, made zero on the axis. Also the number of columns before those of f."""
+    x, y = (np.array([getattr(bead, axis) for bead in beads]) for axis in "xy")
+    stack = np.array([bead.stack for bead in beads])
+    columns = [(stack == s).astype(np.float64) for s in np.unique(stack)]
+    if rotations is not None and np.ptp(np.asarray(rotations)) > 0:
+        angle = np.asarray(rotations)[stack]
+        columns += [
+            (np.cos(angle) * x + np.sin(angle) * y) / radius,
+            (np.cos(angle) * y - np.sin(angle) * x) / radius,
+        ]
+    origin = zernike(order, np.zeros(1), np.zeros(1))
+    surface = (zernike(order, x / radius, y / radius) - origin)[:, 1:]
+    return np.column_stack([*columns, -surface]), len(columns)
+
+
+def _choose_focus_order(
+    beads: Sequence[BeadCurve], sharpest: Array, radius: float, rotations: Sequence[float] | None
+) -> tuple[dict[int, float], int]:
+    """Rms left-one-out residual (m) of each focus order that the beads can carry, and the best order."""
+    scores = {}
+    for order in FOCUS_ORDERS:
+        design, _ = _focus_design(beads, radius, order, rotations)
+        if design.shape[1] > len(beads) / 2:
+            break
+        hat = design @ np.linalg.pinv(design)
+        left_out = (sharpest - hat @ sharpest) / (1 - np.diag(hat))
+        scores[order] = float(np.sqrt(np.mean(left_out**2)))
+    return scores, min(scores, key=lambda order: scores[order]) if scores else 0
+
+
+def _focus_surface(
+    beads: Sequence[BeadCurve], sharpest: Array, radius: float, order: int, rotations: Sequence[float] | None
+) -> tuple[FieldMap, Array, float]:
+    """Focus surface, the beads' own heights (b,) m about it, variance of the surface (m^2)."""
+    design, before = _focus_design(beads, radius, order, rotations)
+    inverse = np.linalg.pinv(design)
+    solution = inverse @ sharpest
+    own_height = sharpest - design @ solution
+    freedom = len(beads) - design.shape[1]
+    # Heights are the beads' own; the surface through them is uncertain by their mean.
+    variance = float(np.sum(own_height**2)) / freedom * design.shape[1] / len(beads) if freedom > 0 else 0.0
+    surface = np.concatenate([[0.0], solution[before:]])
+    surface[0] = -(zernike(order, np.zeros(1), np.zeros(1))[0] @ surface)
+    return FieldMap(radius, surface), own_height, variance

@@ -1,0 +1,94 @@
+"""The forward model of the optics: what the Gaussian fit sees of a particle at (X, Y, z).
+
+Six features of every fitted image, in the order of FEATURES: the apparent lateral motion ``dx``, ``dy``
+(m), the shape ``ln sigma_x``, ``ln sigma_y`` (of px), ``atanh rho``, and the paper's ``rho_amp``. None of
+them changes with brightness. The model knows how they vary with defocus u and over the field, and how
+much real particles scatter about it, because local aberrations and diameters differ.
+
+Heights split as z = u + f(X, Y): u is the distance to the local focus (sharpest image), and the focus
+surface f holds field curvature and tilt, zero on the axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mems6dof_ros.calibration.field_curves import Array, FieldCurves
+from mems6dof_ros.calibration.zernike import zernike, zernike_order
+from mems6dof_ros.localization.localizations import GaussianFits
+
+#: Order of the features everywhere in this room.
+FEATURES = ("dx", "dy", "ln_sigma_x", "ln_sigma_y", "atanh_rho", "rho_amp")
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """A scalar over the field: Zernike ``coefficients`` (terms,) on a disc of ``radius`` m."""
+
+    radius: float
+    coefficients: Array
+
+    def __call__(self, x: Array, y: Array) -> Array:
+        """Value at field positions ``x``, ``y`` (n,) m: (n,)."""
+        order = zernike_order(len(self.coefficients))
+        return zernike(order, x / self.radius, y / self.radius) @ self.coefficients
+
+
+@dataclass(frozen=True)
+class OpticalModel:
+    """``curves`` of the FEATURES over defocus u (m) and field; ``focus`` f(X, Y) in m; ``reference``, the
+    natural logarithm of the amplitude at rho* over the flux (px^-2), for rho_amp.
+
+    ``nodes`` (g,) m: defocus at which ``scatter`` (g, 6, 6) gives the covariance of the particles'
+    features about the model, fit noise excluded. ``focus_variance`` m^2: of the focus surface.
+    """
+
+    curves: FieldCurves
+    focus: FieldMap
+    reference: FieldMap
+    nodes: Array
+    scatter: Array
+    focus_variance: float
+
+    def scatter_at(self, u: Array) -> Array:
+        """``scatter`` interpolated linearly at defocus ``u`` (n,): (n, 6, 6)."""
+        position = np.clip((u - self.nodes[0]) / (self.nodes[1] - self.nodes[0]), 0, len(self.nodes) - 1)
+        left = np.minimum(position.astype(np.intp), len(self.nodes) - 2)
+        weight = (position - left)[:, None, None]
+        return (1 - weight) * self.scatter[left] + weight * self.scatter[left + 1]
+
+
+def field_position(parameters: Array, pixel_size: float, image_size: tuple[int, int]) -> tuple[Array, Array]:
+    """Field coordinates X, Y (n,) m of fitted ``parameters`` (n, 7): origin at the centre of the image."""
+    width, height = image_size
+    return (
+        (parameters[:, 0] - (width - 1) / 2) * pixel_size,
+        (parameters[:, 1] - (height - 1) / 2) * pixel_size,
+    )
+
+
+def features(fits: GaussianFits, pixel_size: float, log_reference: Array) -> tuple[Array, Array]:
+    """FEATURES (n, 6) and their covariance (n, 6, 6) from ``fits``.
+
+    dx and dy are here the fitted positions in m (of px 0). ``log_reference`` (n,): ln of the reference
+    amplitude over flux, in px^-2; with A = flux / (2 pi sigma_x sigma_y sqrt(1 - rho^2)) the paper's
+    rho_amp = rho A(rho*) / A becomes 2 pi exp(log_reference) sigma_x sigma_y rho sqrt(1 - rho^2).
+    """
+    x, y, _, sigma_x, sigma_y, rho, _ = fits.parameters.T
+    complement = 1 - rho**2
+    scale = 2 * np.pi * np.exp(log_reference) * sigma_x * sigma_y
+    rho_amp = scale * rho * np.sqrt(complement)
+    values = np.stack(
+        [x * pixel_size, y * pixel_size, np.log(sigma_x), np.log(sigma_y), np.arctanh(rho), rho_amp], axis=1
+    )
+    jacobian = np.zeros((len(fits), 6, 7))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = pixel_size
+    jacobian[:, 2, 3] = 1 / sigma_x
+    jacobian[:, 3, 4] = 1 / sigma_y
+    jacobian[:, 4, 5] = 1 / complement
+    jacobian[:, 5, 3] = rho_amp / sigma_x
+    jacobian[:, 5, 4] = rho_amp / sigma_y
+    jacobian[:, 5, 5] = scale * (1 - 2 * rho**2) / np.sqrt(complement)
+    return values, jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)

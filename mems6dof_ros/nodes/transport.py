@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import shutil
+import struct
 from pathlib import Path
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -24,7 +25,13 @@ _FRAMES = (Path(__file__).with_name("fastdds_frames.xml"), 136)
 
 # Jazzy reads the first name only, Kilted calls it deprecated.
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-_LOCALHOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+#: Environment of processes that talk only to processes on this machine.
+LOCALHOST_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+#: Messages that a publisher keeps for readers who are behind, and readers before they take them.
+FRAME_DEPTH = 10
+MESSAGE_DEPTH = 100
 
 
 def use_profile(*, frames: bool) -> str:
@@ -44,20 +51,17 @@ def use_profile(*, frames: bool) -> str:
     free = shutil.disk_usage(_SHARED_MEMORY).free // _MEBIBYTE if _SHARED_MEMORY.is_dir() else need
     if free < _MESSAGES[1]:
         raise Mems6dofError(
-            f"{_SHARED_MEMORY}: found {free} MiB free; expected {need} MiB or more: remove {_SHARED_MEMORY}/fastrtps_*"
-            " left by killed processes while no ROS 2 process runs, or enlarge it"
+            f"{_SHARED_MEMORY}: found {free} MiB free; expected {need} MiB or more: enlarge it, or"
+            f" remove {_SHARED_MEMORY}/fastrtps_* left by killed processes while no ROS 2 process runs"
         )
     if free < need:
-        warning = f"{_SHARED_MEMORY} has {free} MiB free, {need} MiB are needed: large frames will be slow or lost"
+        warning = (
+            f"{_SHARED_MEMORY} has {free} MiB free, {need} MiB are needed: large frames will be slow or lost"
+        )
         profile = _MESSAGES[0]
     for name in _PROFILE_VARIABLES:
         os.environ[name] = str(profile)
     return warning
-
-
-def localhost_only() -> dict[str, str]:
-    """Environment of processes that only talk to processes on this machine."""
-    return dict(_LOCALHOST)
 
 
 def reliable(depth: int) -> QoSProfile:
@@ -68,6 +72,12 @@ def reliable(depth: int) -> QoSProfile:
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE,
     )
+
+
+def stamp_of(data: bytes) -> int:
+    """Stamp, ns, of a serialized message that begins with a header: 4 bytes of CDR, then two integers."""
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def keep_large_buffers() -> None:

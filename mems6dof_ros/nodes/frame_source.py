@@ -1,0 +1,329 @@
+"""``frame_source``: publishes the frames of a simulator, of images or of a bag.
+
+::
+
+    WAITING ──▶ RUNNING ◀──▶ STOPPED      ~/start, ~/stop; ~/step: one frame, then STOPPED
+                   │
+                   ▼
+                 ENDED ──▶ exit, or ~/start to begin again
+
+Topics (relative): ``frame_info``, ``truth`` where the source knows it, ``camera_info``, and then
+``image_raw``, all with one header.
+"""
+
+from __future__ import annotations
+
+import enum
+import sys
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import CameraInfo, Image
+from std_srvs.srv import Trigger
+
+from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import NAN, Frame
+from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.common import DRAIN_TIMEOUT, WAIT_PARAMETER, InstrumentNode, run
+from mems6dof_ros.nodes.parameters import Parameter, of_settings
+from mems6dof_ros.recording import messages
+from mems6dof_ros.simulation.settings import SimulationSettings
+from mems6dof_ros.sources.source import SOURCES, open_source
+
+#: What tells that a frame has been dealt with, and its type.
+ACKNOWLEDGING = {"localizations": Localizations, "pose_6dof": Pose6DOF}
+
+PARAMETERS = (
+    Parameter("source", "simulator", "Where frames come from.", choices=tuple(SOURCES)),
+    Parameter(
+        "pacing",
+        "rate",
+        "When the next frame is published: rate: so many a second; consumer: as soon as fewer frames are in"
+        " flight than window, so that nothing is lost; step: at each call of ~/step.",
+        choices=("rate", "consumer", "step"),
+    ),
+    Parameter(
+        "rate",
+        10.0,
+        "Frames per second with pacing rate; 0: as the source delivers them.",
+        "Hz",
+        (0.0, 10_000.0),
+        changeable=True,
+    ),
+    Parameter(
+        "window",
+        4,
+        "Frames in flight with pacing consumer.",
+        "frames",
+        (1, transport.FRAME_DEPTH),
+        changeable=True,
+    ),
+    Parameter(
+        "acknowledged_by",
+        "localizations",
+        "Topic that tells that a frame has been dealt with, with pacing consumer.",
+        choices=tuple(ACKNOWLEDGING),
+    ),
+    Parameter(
+        "acknowledge_timeout",
+        30.0,
+        "Time after which a frame that nobody acknowledged counts as lost and the next one is published.",
+        "s",
+        (0.1, 3600.0),
+    ),
+    Parameter("autostart", True, "Begin by itself; otherwise at a call of ~/start."),
+    Parameter(
+        "at_end", "exit", "What to do after the last frame of a finite source.", choices=("exit", "idle")
+    ),
+    replace(WAIT_PARAMETER, default=("image_raw:1",)),
+    Parameter("simulator.cycles", 0, "Motion cycles to simulate; 0: no end.", "cycles", (0, 2**31 - 1)),
+    Parameter(
+        "simulator.loop",
+        0,
+        "Motion cycles to render at the start and then repeat, which delivers full frames at any rate; 0:"
+        " render each frame when it is due.",
+        "cycles",
+        (0, 10_000),
+    ),
+    *of_settings(SimulationSettings, "simulator."),
+    Parameter("images.path", "", "TIFF stack, or folder of images."),
+    Parameter(
+        "images.pixel_size",
+        NAN,
+        "Image pixel size in object space, where the files do not tell.",
+        "m",
+        optional=True,
+    ),
+    Parameter(
+        "images.step",
+        NAN,
+        "Axial distance from image to image, where the files do not tell.",
+        "m",
+        optional=True,
+    ),
+    Parameter("images.start", 0.0, "Position of the focal plane of the first image.", "m", (-1.0, 1.0)),
+    Parameter("images.period", 0.1, "Time between images, for their stamps.", "s", (1e-6, 1e6)),
+    Parameter("images.saturation_adu", 0, "Largest pixel value; 0: unknown.", "ADU", (0, 65535)),
+    Parameter("bag.path", "", "Directory of a rosbag2 bag, or an .mcap file."),
+    Parameter("bag.topic", "", "Topic of the images; empty: the only one, or the only one named image_raw."),
+)
+
+
+class State(enum.Enum):
+    """See the module."""
+
+    WAITING = enum.auto()
+    RUNNING = enum.auto()
+    STOPPED = enum.auto()
+    ENDED = enum.auto()
+
+
+class FrameSourceNode(InstrumentNode):
+    """Reads frames from a FrameSource and publishes them at the pace that is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__("frame_source", PARAMETERS)
+        self._source = open_source(self.values["source"], **self._options())
+        self._changed = threading.Condition()
+        self._state = State.WAITING
+        self._steps = 0
+        self._abandon = False
+        self._in_flight: dict[int, float] = {}  # stamp in ns: when published, monotonic s
+
+        few, many = transport.reliable(transport.FRAME_DEPTH), transport.reliable(transport.MESSAGE_DEPTH)
+        self._topics: dict[str, Publisher] = {
+            "image_raw": self.create_publisher(Image, "image_raw", few),
+            "frame_info": self.create_publisher(FrameInfo, "frame_info", many),
+            "camera_info": self.create_publisher(CameraInfo, "camera_info", many),
+            "truth": self.create_publisher(GroundTruth, "truth", many),
+        }
+        if self.values["pacing"] == "consumer":
+            topic = self.values["acknowledged_by"]
+            self.create_subscription(ACKNOWLEDGING[topic], topic, self._on_acknowledged, many, raw=True)
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_service(Trigger, "~/step", self._on_step)
+        self.health.gauge("frames in flight", lambda: len(self._in_flight))
+        info = self._source.info
+        self.get_logger().info(
+            f"{info.kind}: {info.width} x {info.height} px {info.encoding},"
+            f" {'no end' if info.frames is None else f'{info.frames} frames'}"
+        )
+        self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
+        self._thread.start()
+
+    def end(self, spin: Any) -> None:
+        with self._changed:
+            self._abandon = True
+            self._changed.notify_all()
+        self._thread.join(DRAIN_TIMEOUT)
+        self._source.stop()
+        for publisher in self._topics.values():
+            publisher.wait_for_all_acked(Duration(seconds=DRAIN_TIMEOUT))
+        self.get_logger().info(
+            f"{self.health.total('frames')} frames published, {self.health.total('refused')} refused,"
+            f" {self.health.total('lost')} lost"
+        )
+
+    def _options(self) -> dict[str, Any]:
+        """Options of the chosen source, from the parameters that begin with its name."""
+        prefix = self.values["source"] + "."
+        options = {
+            name.removeprefix(prefix): value for name, value in self.values.items() if name.startswith(prefix)
+        }
+        if options.get("path") == "":
+            raise InputError(
+                f"parameter {prefix}path", "no path", f"what source '{self.values['source']}' reads"
+            )
+        return options
+
+    # The thread of the frames -------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            self.wait_for_subscribers(self._topics, lambda: self._abandon)
+            self._set_state(State.RUNNING if self.values["autostart"] else State.STOPPED)
+            while self._wait_until_wanted():
+                self._play()
+                if self.values["at_end"] == "exit":
+                    self.finished.set()
+                    return
+        except BaseException as error:  # handed to the main thread, which ends the node
+            self.failure = error
+
+    def _play(self) -> None:
+        """Publish the source from its first frame to its last."""
+        self._source.start()
+        due = time.monotonic()
+        while self._wait_until_wanted():
+            try:
+                frame = self._source.read(timeout=1.0)
+            except TimeoutError:
+                self.health.state = "the source delivers no frames"
+                continue
+            except InputError as error:
+                self.health.refused(str(error))
+                continue
+            if frame is None:
+                break
+            due = self._wait_for_turn(due)
+            if self._abandon:
+                return
+            self._publish(frame)
+            with self._changed:
+                self._steps = max(self._steps - 1, 0)
+        self._wait_for_consumer(0)
+        self._set_state(State.ENDED)
+
+    def _publish(self, frame: Frame) -> None:
+        stamp = frame.stamp_ns
+        image = messages.to_rclpy(messages.image(frame))
+        with self._changed:
+            self._in_flight[stamp] = time.monotonic()
+        start = time.monotonic()
+        frame = replace(frame, published_ns=time.time_ns())
+        self._topics["frame_info"].publish(messages.to_rclpy(messages.frame_info(frame)))
+        for truth in messages.ground_truths(frame):
+            self._topics["truth"].publish(messages.to_rclpy(truth))
+        self._topics["camera_info"].publish(messages.to_rclpy(messages.camera_info(frame)))
+        self._topics["image_raw"].publish(image)
+        self.health.time("publishing", time.monotonic() - start)
+        self.health.count("frames")
+        if frame.frames_dropped:
+            self.health.lost(frame.frames_dropped, f"the source lost {frame.frames_dropped} frames")
+
+    # Pacing -------------------------------------------------------------------------------------
+
+    def _wait_until_wanted(self) -> bool:
+        """Wait while stopped without a step to make; False: the node ends."""
+
+        def wanted() -> bool:
+            running = self._state is State.RUNNING and self.values["pacing"] != "step"
+            return self._abandon or running or self._steps > 0
+
+        with self._changed:
+            self._changed.wait_for(wanted)
+        return not self._abandon
+
+    def _wait_for_turn(self, due: float) -> float:
+        """Wait until the next frame may be published; returns when the one after is due, monotonic s."""
+        if self.values["pacing"] == "consumer":
+            self._wait_for_consumer(self.get_parameter("window").value - 1)
+            return due
+        self._in_flight.clear()
+        rate = self.get_parameter("rate").value
+        if self.values["pacing"] != "rate" or rate == 0:
+            return due
+        now = time.monotonic()
+        if now - due > 1 / rate:
+            due = now  # late by more than a period: begin a new schedule instead of catching up
+            self.health.count("frames late")
+        with self._changed:
+            self._changed.wait_for(lambda: self._abandon, max(due - now, 0))
+        return due + 1 / rate
+
+    def _wait_for_consumer(self, in_flight: int) -> None:
+        """Wait until at most ``in_flight`` frames are neither acknowledged nor given up."""
+        if self.values["pacing"] != "consumer":
+            return
+        timeout = self.values["acknowledge_timeout"]
+        with self._changed:
+            while len(self._in_flight) > in_flight and not self._abandon:
+                stamp, published = next(iter(self._in_flight.items()))
+                if (left := published + timeout - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                else:
+                    del self._in_flight[stamp]
+                    self.health.lost(1, f"nobody acknowledged the frame of {stamp} ns within {timeout:g} s")
+
+    def _on_acknowledged(self, data: bytes) -> None:
+        with self._changed:
+            self._in_flight.pop(transport.stamp_of(data), None)
+            self._changed.notify_all()
+
+    # Services -----------------------------------------------------------------------------------
+
+    def _set_state(self, state: State) -> None:
+        with self._changed:
+            self._state = state
+            self.health.state = state.name.lower()
+            self._changed.notify_all()
+        self.get_logger().info(self.health.state)
+
+    def _on_start(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._answer(response, State.RUNNING)
+
+    def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._answer(response, State.STOPPED)
+
+    def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self._changed:
+            self._steps += 1
+        return self._answer(response, State.STOPPED)
+
+    def _answer(self, response: Trigger.Response, state: State) -> Trigger.Response:
+        """Change to ``state`` where there is still something to publish."""
+        if self._state is State.WAITING:
+            response.success, response.message = False, self.health.state
+            return response
+        if self._state is State.ENDED and state is State.STOPPED:
+            response.success, response.message = False, "all frames have been published: start begins again"
+            return response
+        self._set_state(state)
+        response.success, response.message = True, self.health.state
+        return response
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns the exit status."""
+    transport.keep_large_buffers()
+    return run(FrameSourceNode, args, frames=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

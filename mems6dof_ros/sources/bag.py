@@ -9,8 +9,9 @@ from typing import Any
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
-from mems6dof_ros.recording import messages
+from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.recording.bag import BagReader
+from mems6dof_ros.recording.frames import CAMERA, camera_from_json
 from mems6dof_ros.sources.source import SourceInfo
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -35,15 +36,20 @@ class BagSource:
             if bag.topics.get(self._topic) != IMAGE:
                 raise InputError(str(path), f"no images on topic '{self._topic}'", _choices(bag))
             self._count = bag.counts[self._topic]
+            stated = bag.provenance().get(CAMERA)
         namespace = self._topic.rsplit("/", 1)[0]
-        self._info_topic, self._truth_topic = f"{namespace}/frame_info", f"{namespace}/truth"
+        self._info_topic, self._truth_topic = (
+            f"{namespace}/{topics.FRAME_INFO}",
+            f"{namespace}/{topics.TRUTH}",
+        )
         self.start()
         first = self.read()
         self.stop()
         if first is None:
             raise InputError(str(path), f"no message on '{self._topic}'", "at least one image")
         height, width = first.image.shape
-        self._info = SourceInfo("bag", width, height, first.encoding, first.pixel_size, self._count)
+        camera = camera_from_json(stated) if stated else None
+        self._info = SourceInfo("bag", width, height, first.encoding, first.pixel_size, self._count, camera)
 
     @property
     def info(self) -> SourceInfo:

@@ -1,0 +1,12 @@
+"""Topic names, relative to the namespace, of what the nodes publish and a bag holds."""
+
+from __future__ import annotations
+
+IMAGE = "image_raw"
+CAMERA_INFO = "camera_info"
+FRAME_INFO = "frame_info"
+TRUTH = "truth"
+LOCALIZATIONS = "localizations"
+POSE_6DOF = "pose_6dof"
+POSE = "pose"
+POSE_WITH_COVARIANCE = "pose_with_covariance"

@@ -1,0 +1,116 @@
+"""Rigid-body algebra: rotations, poses, their covariances, and the weighted Kabsch solution.
+
+A pose is ``q = R p + t``, body to microscope frame. Everywhere in this project a pose is disturbed as
+``R -> Exp(w) R, t -> t + d`` with w about the *fixed* axes, and its 6 x 6 covariance is that of (d, w):
+the convention of geometry_msgs/PoseWithCovariance (REP-103).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class RigidPose(NamedTuple):
+    """Body to microscope frame: ``rotation`` (3, 3), ``translation`` (3,) m."""
+
+    rotation: Array
+    translation: Array
+
+    def apply(self, points: Array) -> Array:
+        """``R p + t`` for ``points`` (..., 3) m."""
+        return points @ self.rotation.T + self.translation
+
+    def inverse(self) -> RigidPose:
+        """The pose that undoes this one."""
+        return RigidPose(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def then(self, other: RigidPose) -> RigidPose:
+        """First this pose, then ``other``: ``other . self``."""
+        return RigidPose(
+            other.rotation @ self.rotation, other.rotation @ self.translation + other.translation
+        )
+
+
+IDENTITY = RigidPose(np.eye(3), np.zeros(3))
+
+
+def hat(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``hat(v) @ u = v x u``."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def rotation_z(angle: float) -> Array:
+    """Rotation matrix (3, 3) about z by ``angle`` rad."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def exp_so3(w: Array) -> Array:
+    """Rotation matrix (3, 3) of the rotation vector ``w`` (3,) rad (Rodrigues)."""
+    angle = math.sqrt(float(w @ w))
+    k = hat(w)
+    if angle < 1e-4:  # series: the closed form cancels
+        return np.eye(3) + (1 - angle**2 / 6) * k + (0.5 - angle**2 / 24) * (k @ k)
+    return np.eye(3) + math.sin(angle) / angle * k + (1 - math.cos(angle)) / angle**2 * (k @ k)
+
+
+def log_so3(rotation: Array) -> Array:
+    """Rotation vector (3,) rad of ``rotation``, of length at most pi; safe at 0 and at pi."""
+    vee = 0.5 * np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    sine = math.sqrt(float(vee @ vee))
+    cosine = 0.5 * (float(np.trace(rotation)) - 1)
+    angle = math.atan2(sine, cosine)
+    if sine > 1e-6:
+        return vee * (angle / sine)
+    if cosine > 0:
+        return vee
+    # Near pi the antisymmetric part vanishes; the axis is in the symmetric part.
+    symmetric = 0.5 * (rotation + rotation.T) + np.eye(3)
+    axis = symmetric[:, int(np.argmax(np.diag(symmetric)))]
+    axis = axis / np.linalg.norm(axis)
+    return axis * (angle if vee @ axis >= 0 else -angle)
+
+
+def left_jacobian(w: Array) -> Array:
+    """J (3, 3) of ``Exp(w + d) = Exp(J d) Exp(w)`` to first order (Sola et al. 2018, eq. 145)."""
+    angle = math.sqrt(float(w @ w))
+    k = hat(w)
+    if angle < 1e-4:
+        return np.eye(3) + 0.5 * k + (k @ k) / 6
+    return np.eye(3) + (1 - math.cos(angle)) / angle**2 * k + (angle - math.sin(angle)) / angle**3 * (k @ k)
+
+
+def kabsch(body: Array, measured: Array, weights: Array | None = None) -> RigidPose:
+    """Least-squares pose that takes ``body`` (n, 3) onto ``measured`` (n, 3) (Kabsch 1976), n >= 3,
+    with scalar ``weights`` (n,); always a proper rotation."""
+    w = np.full(len(body), 1 / len(body)) if weights is None else weights / weights.sum()
+    body_mean, measured_mean = w @ body, w @ measured
+    covariance = (w[:, None] * (body - body_mean)).T @ (measured - measured_mean)
+    u, _, vt = np.linalg.svd(covariance)
+    sign = math.copysign(1.0, float(np.linalg.det(u @ vt)))
+    rotation = vt.T @ np.diag([1.0, 1.0, sign]) @ u.T
+    return RigidPose(rotation, measured_mean - rotation @ body_mean)
+
+
+def shift_origin(covariance: Array, lever: Array) -> Array:
+    """Covariance (6, 6) of a pose whose origin moves by ``lever`` (3,) m, given in the microscope
+    frame: ``t' = t + lever``, hence ``d' = d + w x lever``."""
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = -hat(lever)
+    return jacobian @ covariance @ jacobian.T

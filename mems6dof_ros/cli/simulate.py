@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import math
 from collections.abc import Iterator
@@ -59,6 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and write; what was written before an interruption is valid."""
+    from mems6dof_ros.cli.interrupt import stop_on_signal
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.recording.frames import write_bag, write_tiff
     from mems6dof_ros.simulation.experiment import focus_stack, motion_frames
@@ -80,10 +82,13 @@ def run(args: argparse.Namespace) -> int:
         frames, total = motion_frames(settings, args.cycles), args.cycles
     write = write_bag if args.format == "bag" else write_tiff
     provenance = {"made_by": "mems6dof simulate", "simulation": json.dumps(settings.to_dict())}
-    with Progress("frames") as progress:
-        write(args.out, frames, camera_noise(settings), provenance, lambda done: progress(done, total))
+    first = next(frames)  # settings that cannot be simulated show here, before anything is created
+    with Progress("frames") as progress, stop_on_signal() as stopped:
+        until_stopped = itertools.takewhile(lambda _: not stopped(), itertools.chain([first], frames))
+        write(args.out, until_stopped, camera_noise(settings), provenance, lambda done: progress(done, total))
+        interrupted = stopped()
     print(args.out)
-    return 0
+    return 130 if interrupted else 0
 
 
 def _flag(name: str) -> str:

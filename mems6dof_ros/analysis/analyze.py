@@ -1,0 +1,174 @@
+"""A whole recording through the same core as the live nodes, without ROS and deterministic."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import chain
+from pathlib import Path
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import Frame, GroundTruth
+from mems6dof_ros.localization.localizations import Localizations
+from mems6dof_ros.localization.localizer import Localizer
+from mems6dof_ros.pose.cycle_pose import CyclePose
+from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.recording import messages, topics
+from mems6dof_ros.recording.bag import BagWriter
+from mems6dof_ros.recording.frames import write_frame
+from mems6dof_ros.recording.tables import CYCLES, LOCALIZATIONS, TableWriter, sightings
+from mems6dof_ros.sources.source import FrameSource
+
+#: Called as progress(done, total) after every frame; total 0: unknown.
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class Summary:
+    """What an analysis did. ``refused``: why frames could not be used. ``truths`` parallel to ``poses``,
+    None where the recording knows no truth of that body."""
+
+    frames: int = 0
+    localizations: int = 0
+    refused: list[str] = field(default_factory=list)
+    poses: list[CyclePose] = field(default_factory=list)
+    truths: list[GroundTruth | None] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def statuses(self) -> Counter[str]:
+        """Number of poses by status."""
+        return Counter(pose.status.name.lower() for pose in self.poses)
+
+
+def analyze(
+    source: FrameSource,
+    localizer: Localizer,
+    estimators: Sequence[PoseEstimator],
+    out: Path,
+    *,
+    provenance: Mapping[str, str] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
+    keep_images: bool = False,
+    progress: Progress = lambda done, total: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Summary:
+    """Measure all frames of ``source``; write ``bag/``, ``cycles.csv``, ``localizations.csv`` into ``out``.
+
+    Nothing in the results depends on when or how fast it runs: latencies stay unknown, and messages are
+    recorded at the stamps of their frames. A frame that cannot be used is left out and its reason kept,
+    but the first one must be usable. ``stopped`` is asked between frames; what is done by then is complete.
+    Raises InputError for an ``out`` that is not empty, and for the first frame.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(str(out), "something there already", "a new or empty directory")
+    summary = Summary()
+    source.start()
+    try:
+        measured = _measured(source, localizer, summary.refused)
+        # The first frame is measured before anything is created: most mistakes show there.
+        first = next(measured, None)
+        if first is None:
+            raise InputError("input", "no frames", "at least one")
+        out.mkdir(parents=True, exist_ok=True)
+        provenance = {
+            "made_by": "mems6dof analyze",
+            **settings_of(localizer, estimators),
+            **(provenance or {}),
+        }
+        with (
+            BagWriter(out / "bag", compression="zstd", provenance=provenance) as bag,
+            TableWriter(out / "cycles.csv", CYCLES, provenance) as cycles,
+            TableWriter(out / "localizations.csv", LOCALIZATIONS, provenance) as particles,
+        ):
+            for name, data in (attachments or {}).items():
+                bag.attach(name, data)
+            for frame, found in chain([first], measured):
+                poses = [estimator.update(found) for estimator in estimators]
+                _write(bag, frame, found, poses, keep_images)
+                for pose in poses:
+                    cycles.write(pose)
+                for sighting in sightings(found, poses):
+                    particles.write(sighting)
+                for writer in (bag, cycles, particles):
+                    writer.flush()
+                _count(summary, frame, found, poses)
+                progress(summary.frames + len(summary.refused), source.info.frames or 0)
+                if stopped():
+                    summary.interrupted = True
+                    break
+    finally:
+        source.stop()
+    return summary
+
+
+def settings_of(localizer: Localizer, estimators: Sequence[PoseEstimator]) -> dict[str, str]:
+    """Everything set that bears on the results, for the provenance."""
+    calibration = localizer.calibration
+    settings = {
+        "calibration_id": calibration.calibration_id if calibration else "none",
+        "calibration_method": calibration.method if calibration else "none",
+        "localizer": json.dumps(asdict(localizer.settings)),
+    }
+    for estimator in estimators:
+        settings[f"pose_of_{estimator.body}"] = json.dumps(asdict(estimator.settings))
+    return settings
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of a folder's files."""
+    digest = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if path.is_dir():
+            digest.update(file.name.encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _measured(
+    source: FrameSource, localizer: Localizer, refused: list[str]
+) -> Iterator[tuple[Frame, Localizations]]:
+    """Frames with their localizations; after the first, those that cannot be used become reasons."""
+    usable = False
+    while True:
+        try:
+            frame = source.read()
+            if frame is None:
+                return
+            found = localizer.localize(frame)
+        except InputError as error:
+            if not usable:
+                raise
+            refused.append(str(error))
+            continue
+        usable = True
+        yield frame, found
+
+
+def _write(
+    bag: BagWriter, frame: Frame, found: Localizations, poses: Sequence[CyclePose], keep_images: bool
+) -> None:
+    write_frame(bag, frame)
+    if keep_images:
+        bag.write_message(f"/{topics.IMAGE}", messages.image(frame), frame.stamp_ns)
+    bag.write_message(f"/{topics.LOCALIZATIONS}", messages.localizations(found), frame.stamp_ns)
+    for pose in poses:
+        bag.write_message(f"/{topics.POSE_6DOF}", messages.pose6dof(pose), frame.stamp_ns)
+        if pose.valid:
+            bag.write_message(f"/{topics.POSE}", messages.pose_stamped(pose), frame.stamp_ns)
+            covariant = messages.pose_with_covariance_stamped(pose)
+            bag.write_message(f"/{topics.POSE_WITH_COVARIANCE}", covariant, frame.stamp_ns)
+
+
+def _count(summary: Summary, frame: Frame, found: Localizations, poses: Sequence[CyclePose]) -> None:
+    summary.frames += 1
+    summary.localizations += len(found)
+    truths = {truth.body: truth for truth in frame.truth}
+    for pose in poses:
+        summary.poses.append(pose)
+        summary.truths.append(truths.get(pose.body))

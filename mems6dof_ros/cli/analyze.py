@@ -1,0 +1,95 @@
+"""`mems6dof analyze`: a recording to localizations and poses, by the same core as the live nodes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mems6dof_ros.cli.inputs import add_camera_options, add_image_options, camera_of, open_input
+
+if TYPE_CHECKING:
+    from mems6dof_ros.analysis.analyze import Summary
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Options: what to read, by which calibration, where to write."""
+    parser = subparsers.add_parser(
+        "analyze",
+        help="measure a recording: localizations and poses",
+        description="Measure a bag, a TIFF stack or a folder of images, and write a bag, cycles.csv and "
+        "localizations.csv. The same input gives the same results, digit for digit.",
+    )
+    parser.add_argument("input", type=Path, help="bag, .mcap file, TIFF stack or folder of images")
+    parser.add_argument(
+        "--calibration", required=True, help="calibration file, or 'none': x and y only, and no pose"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="directory to create")
+    parser.add_argument("--method", help="method of reading z (default: what the calibration proposes)")
+    parser.add_argument("--body", default="load_gear", help="name of the rigid body (default: %(default)s)")
+    parser.add_argument(
+        "--reference",
+        choices=("map", "previous"),
+        default="map",
+        help="register to the constellation map (default) or to the previous micrograph",
+    )
+    parser.add_argument("--keep-images", action="store_true", help="write the images into the new bag too")
+    add_image_options(parser)
+    add_camera_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Analyze; an interruption leaves the frames measured so far, completely."""
+    from mems6dof_ros.analysis.analyze import analyze, sha256_of
+    from mems6dof_ros.calibration.file import load_calibration
+    from mems6dof_ros.cli.interrupt import stop_on_signal
+    from mems6dof_ros.cli.progress import Progress
+    from mems6dof_ros.localization.localizer import Localizer
+    from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings
+
+    calibration, attachments = None, {}
+    if args.calibration != "none":
+        calibration = load_calibration(args.calibration, args.method)
+        attachments["calibration.yaml"] = Path(args.calibration).read_bytes()
+    source = open_input(args.input, args)
+    camera = camera_of(args, source.info, calibration.camera if calibration else None)
+    localizer = Localizer(camera, calibration)
+    estimators = [PoseEstimator(PoseSettings(reference=args.reference), args.body)] if calibration else []
+    provenance = {"input": args.input.name, "input_sha256": sha256_of(args.input)}
+    with Progress("frames") as progress, stop_on_signal() as stopped:
+        summary = analyze(
+            source,
+            localizer,
+            estimators,
+            args.out,
+            provenance=provenance,
+            attachments=attachments,
+            keep_images=args.keep_images,
+            progress=progress,
+            stopped=stopped,
+        )
+    print("\n".join(_lines(summary)))
+    print(args.out)
+    return 130 if summary.interrupted else 0
+
+
+def _lines(summary: Summary) -> list[str]:
+    from mems6dof_ros.analysis.truth import compare
+
+    lines = [f"frames {summary.frames}, localizations {summary.localizations}"]
+    lines += [f"refused {reason}" for reason in summary.refused]
+    if summary.interrupted:
+        lines.append("interrupted: the frames so far are complete")
+    if summary.poses:
+        counts = ", ".join(f"{status} {count}" for status, count in sorted(summary.statuses.items()))
+        lines.append(f"poses: {counts}")
+    pairs = [(p, t) for p, t in zip(summary.poses, summary.truths, strict=True) if t is not None and p.valid]
+    if pairs:
+        comparison = compare([pose for pose, _ in pairs], [truth for _, truth in pairs])
+        lines.append(f"{'against truth':14}{'rms error':>12}{'claimed':>12}")
+        for name, error, claimed in comparison.table():
+            unit, scale = ("nm", 1e9) if name in ("dx", "dy", "dz") else ("urad", 1e6)
+            lines.append(f"{name:14}{error * scale:12.3f}{claimed * scale:12.3f} {unit}")
+        lines.append(f"normalised estimation error squared / 6: {comparison.nees_per_dof:.2f}")
+    return lines

@@ -81,9 +81,9 @@ def _bin(image: NDArray[np.generic], binning: int) -> NDArray[np.float32]:
     whole = image[: height * binning, : width * binning]
     if binning == 1:
         return whole.astype(np.float32)
-    # The mean of 8-bit pixels would be rounded to 8 bit.
-    whole = whole if whole.dtype == np.uint16 else whole.astype(np.uint16) << 8
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    # OpenCV rounds means to the type of the pixels: too coarse for 8 bit.
+    fine = whole.astype(np.uint16) << 8 if whole.dtype == np.uint8 else whole.astype(np.uint16, copy=False)
+    return np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def _score(cells: NDArray[np.float32], settings: DetectionSettings) -> NDArray[np.float32]:
@@ -105,12 +105,14 @@ def _background(cells: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     height, width = cells.shape
     coarse = (max(round(5 * width / size), 1), max(round(5 * height / size), 1))
     means = cv2.resize(cells, coarse, interpolation=cv2.INTER_AREA)
-    return cv2.resize(cv2.medianBlur(means, 5), (width, height), interpolation=cv2.INTER_LINEAR)
+    smooth = cv2.resize(cv2.medianBlur(means, 5), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(smooth, dtype=np.float32)
 
 
 def _blur(cells: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     size = 2 * int(np.ceil(2.5 * sigma)) + 1
-    return cv2.GaussianBlur(cells, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+    blurred = cv2.GaussianBlur(cells, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(blurred, dtype=np.float32)
 
 
 def _deviation(cells: NDArray[np.float32]) -> float:

@@ -51,7 +51,7 @@ def fit_gaussians(
     """
     check_image(image, "image")
     camera.check_shape(image.shape)
-    positions = np.asarray(positions_px, dtype=np.float64).reshape(-1, 2)
+    positions = np.array(positions_px, dtype=np.float64).reshape(-1, 2)
     if weighting not in WEIGHTINGS:
         raise InputError("weighting", repr(weighting), f"one of {', '.join(WEIGHTINGS)}")
     if not (SMALLEST_WINDOW_PX <= window_px <= LARGEST_WINDOW_PX and window_px % 2 == 1):
@@ -65,8 +65,11 @@ def fit_gaussians(
         starts = np.hstack([positions, start.parameters[:, 2:]])
     n = len(positions)
     parameters, covariance, quality = np.empty((n, 7)), np.empty((n, 7, 7)), np.empty((n, 4))
+    # Read-only or not is part of a compiled signature: one for all.
+    pixels = np.ascontiguousarray(image).view()
+    pixels.flags.writeable = False
     kernels.fit_windows(
-        np.ascontiguousarray(image),
+        pixels,
         starts,
         *camera.maps,
         float(camera.saturation_adu),

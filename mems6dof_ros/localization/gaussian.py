@@ -61,33 +61,33 @@ def cramer_rao(parameters: Array, columns: Array, rows: Array, read_noise_electr
     """
     variance = gaussian(parameters, columns, rows) + read_noise_electrons**2
     jacobian = derivatives(parameters, columns, rows).reshape(-1, 7)
-    return np.linalg.inv(jacobian.T @ (jacobian / variance.reshape(-1, 1)))
+    return np.asarray(np.linalg.inv(jacobian.T @ (jacobian / variance.reshape(-1, 1))))
 
 
 def residuals(
-    parameters: Array, columns: Array, rows: Array, data: Array, noise_variance: Array | float, weighting: str
+    parameters: Array, columns: Array, rows: Array, data: Array, noise: Array | float, weighting: str
 ) -> Array:
     """Residuals whose sum of squares the fit of that ``weighting`` minimises, flat.
 
-    ``data`` electrons; ``noise_variance`` electrons^2: the read noise, or for the relative weighting its
-    substitute ``kappa A0 - B0`` (see fitting.py).
+    ``data`` electrons. ``noise`` electrons^2: variance of read noise; for ``relative_light_weighting`` the
+    fixed variance that replaces the camera's (see docs/localization.md).
     """
     model = gaussian(parameters, columns, rows)
-    if weighting == "uniform":
-        found = data - model
-    elif weighting == "poisson":
-        mean = np.maximum(model + noise_variance, VARIANCE_FLOOR)
-        count = np.maximum(data + noise_variance, VARIANCE_FLOOR)
+    if weighting == "poisson":
+        mean = np.maximum(model + noise, VARIANCE_FLOOR)
+        count = np.maximum(data + noise, VARIANCE_FLOOR)
         deviance = 2 * (mean - count - count * np.log(mean / count))
-        found = np.sign(count - mean) * np.sqrt(np.maximum(deviance, 0))
-    else:
-        variance = np.maximum(np.maximum(data, model) + noise_variance, VARIANCE_FLOOR)
-        found = (data - model) / np.sqrt(variance)
-    return found.ravel()
+        return np.asarray(np.sign(count - mean) * np.sqrt(np.maximum(deviance, 0))).ravel()
+    variance: Array | float = 1.0
+    if weighting == "light_weighting":
+        variance = np.maximum(np.maximum(data, model) + noise, VARIANCE_FLOOR)
+    elif weighting == "relative_light_weighting":
+        variance = noise
+    return ((data - model) / np.sqrt(variance)).ravel()
 
 
 def reference_fit(
-    data: Array, columns: Array, rows: Array, start: Array, noise_variance: Array | float, weighting: str
+    data: Array, columns: Array, rows: Array, start: Array, noise: Array | float, weighting: str
 ) -> Array:
     """Seven parameters that minimise ``residuals``, from ``start``, by SciPy's trust-region least squares."""
     low = [-np.inf, -np.inf, -np.inf, 0.1, 0.1, -0.99, -np.inf]
@@ -95,11 +95,11 @@ def reference_fit(
     solution = least_squares(
         residuals,
         start,
-        args=(columns, rows, data, noise_variance, weighting),
+        args=(columns, rows, data, noise, weighting),
         bounds=(low, high),
         x_scale=np.abs(start) + 0.1,
         xtol=1e-13,
         ftol=1e-13,
         gtol=1e-13,
     )
-    return solution.x
+    return np.asarray(solution.x)

@@ -6,7 +6,7 @@ All kernels release the GIL (threads over frames) and are cached on disk. Arrays
 name           shape, type         content
 =============  ==================  =====================================================================
 image          (h, w) u1 or u2     pixels, ADU
-starts         (n, 2) or (n, 7)    particles: px of the image, or whole parameters of an earlier fit
+starts         (n, 2) or (n, 7)    positions, px of the image, or all parameters of an earlier fit
 offset         (h, w) or (1, 1)    ADU
 gain           (h, w) or (1, 1)    ADU per electron
 read_variance  (h, w) or (1, 1)    electrons^2
@@ -322,12 +322,12 @@ def _read_window(
     left, right = max(column - half, 0), min(column + half, width - 1)
     maps = offset.size > 1 or gain.size > 1 or read_variance.size > 1
     least, scale = offset[0, 0], 1 / gain[0, 0]
-    largest = 0
+    largest: Any = 0
     for i in range(top, bottom + 1):
         k = (i - row + half) * stride - column + half
         for j in range(left, right + 1):
-            adu = np.int64(image[i, j])
-            largest = max(largest, adu)
+            adu: Any = np.int64(image[i, j])
+            largest = adu if adu > largest else largest
             data[k + j] = (adu - least) * scale
             valid[k + j] = 1.0
         if maps:
@@ -579,7 +579,7 @@ def fit_windows(
         cut, largest = _read_window(
             image, column, row, offset, gain, read_variance, window, stride, data, read, valid
         )
-        known = starts.shape[1] == 7
+        known = starts.shape[1] == 7 and not math.isnan(starts[n, 2])
         if known:
             theta[:] = starts[n]
             theta[0] -= column

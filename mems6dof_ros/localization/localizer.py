@@ -42,7 +42,7 @@ class LocalizerSettings:
     neighbour_flux: float = 0.02
     least_significance: float = 8.0
     most_sigma: float = 0.4
-    most_misfit: float = 0.5
+    most_misfit: float = 0.4
 
     def __post_init__(self) -> None:
         for name in (
@@ -150,13 +150,15 @@ class Localizer:
 
 
 def misfit(fits: GaussianFits, window_px: int) -> NDArray[np.float64]:
-    """Residual beyond noise, relative to the particle's light, (n,).
+    """Residual relative to the particle's light, as far as noise does not explain it, (n,).
 
-    A model wrong by the fraction m adds ``m^2 flux`` to chi-square however bright the particle is:
-    ``m = sqrt((chi_square - 1) (window_px^2 - 7) / flux)``.
+    A model wrong by the fraction m adds ``m^2 flux`` to chi-square, however bright the particle:
+    ``m = sqrt((chi_square - noise) (window_px^2 - 7) / flux)``, where noise reaches 3 standard deviations
+    above 1.
     """
-    excess = np.maximum(fits.chi_square - 1, 0) * (window_px**2 - 7)
-    return np.sqrt(excess / fits.flux)
+    degrees = window_px**2 - 7
+    excess = np.maximum(fits.chi_square - 1 - 3 * math.sqrt(2 / degrees), 0)
+    return np.sqrt(excess * degrees / fits.flux)
 
 
 def _take(fits: GaussianFits, chosen: NDArray[np.bool_]) -> GaussianFits:

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import FrameType
 from typing import Any, Generic, Literal, TypeVar
 
@@ -136,7 +136,7 @@ class Health:
         self._problems: list[tuple[bytes, str]] = []
         self._gauges: dict[str, Callable[[], Any]] = {}
         self._since = time.monotonic()
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", transport.reliable(10))
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", transport.MESSAGES)
         # Wall time: with use_sim_time and no clock, diagnostics must still say so.
         node.create_timer(self.PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -210,49 +210,82 @@ class Health:
 
 
 class InstrumentNode(Node):
-    """A node with declared parameters, ``values`` by name, and ``health``.
+    """A node with declared parameters, ``values`` by name, ``health``, and perhaps a ``worker``.
 
-    ``finished`` set from any thread ends the process in good order.
+    ``finished`` set from any thread ends the process in good order, ``failure`` with its exception.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         super().__init__(name)
         self.values = declare(self, parameters)
         self.health = Health(self)
+        self.worker: Worker[Any] | None = None
         self.finished = threading.Event()
         self.failure: BaseException | None = None
 
-    def wait_for_subscribers(self, publishers: dict[str, Publisher], abandon: Callable[[], bool]) -> None:
-        """Wait until the topics of the parameter ``wait_for_subscribers`` have their subscribers.
+    def start_worker(self, work: Callable[[Any], None]) -> Worker[Any]:
+        """The node's worker, with the queue that the parameters describe."""
+        self.worker = Worker(work, self.values["queue_size"], self.values["queue_policy"])
+        self.health.gauge("queue", self.worker.__len__)
+        return self.worker
 
-        Called from a worker; ``abandon`` says when to give up. InputError from ``required_subscribers``.
+    def when_ready(self, waiting_for: Callable[[], str], act: Callable[[], None]) -> None:
+        """Call ``act`` in the executor's thread, once ``waiting_for`` returns nothing to wait for.
+
+        Nodes subscribe, or begin to publish, only then, so that readiness travels from the end of the chain
+        to its beginning and the first message finds everybody listening.
+        """
+        told = -float("inf")
+
+        def look() -> None:
+            nonlocal told
+            if missing := waiting_for():
+                self.health.state = f"waiting for {missing}"
+                if time.monotonic() - told > 5.0:
+                    told = time.monotonic()
+                    self.get_logger().info(self.health.state)
+                return
+            timer.cancel()
+            act()
+
+        timer = self.create_timer(0.02, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def missing_subscribers(self, publishers: Mapping[str, Publisher]) -> Callable[[], str]:
+        """For ``when_ready``: the topics that lack subscribers by the parameter ``wait_for_subscribers``.
+
+        Raises InputError where the parameter is malformed.
         """
         required = required_subscribers(self.values[WAIT_PARAMETER.name], publishers)
-        told = 0.0
-        while not abandon():
-            missing = [
-                f"{topic} ({publishers[topic].get_subscription_count()} of {number})"
+
+        def missing() -> str:
+            counts = {topic: publishers[topic].get_subscription_count() for topic in required}
+            lacking = [
+                f"{topic} ({counts[topic]} of {number})"
                 for topic, number in required.items()
-                if publishers[topic].get_subscription_count() < number
+                if counts[topic] < number
             ]
-            if not missing:
-                return
-            self.health.state = f"waiting for subscribers of {', '.join(missing)}"
-            if time.monotonic() - told > 5:
-                told = time.monotonic()
-                self.get_logger().info(self.health.state)
-            time.sleep(0.01)
+            return f"subscribers of {', '.join(lacking)}" if lacking else ""
+
+        return missing
+
+    def tell(self, state: str) -> None:
+        """Note and log the state of the node."""
+        self.health.state = state
+        self.get_logger().info(state)
 
     def check(self) -> None:
         """Raise what ended a thread of this node; called from the main loop."""
-        if self.failure:
-            raise self.failure
+        failure = self.failure or (self.worker.failure if self.worker else None)
+        if failure:
+            raise failure
 
     def end(self, spin: Callable[[float], None]) -> None:
         """Finish what is queued and release everything; ``spin(s)`` lets callbacks run meanwhile."""
+        if self.worker and (left := self.worker.end()):
+            self.get_logger().warning(f"{left} messages left in the queue")
 
 
-def required_subscribers(entries: Sequence[str], topics: Any) -> dict[str, int]:
+def required_subscribers(entries: Sequence[str], topics: Collection[str]) -> dict[str, int]:
     """``["pose_6dof:2"]`` to ``{"pose_6dof": 2}``; InputError where an entry is malformed."""
     required = {}
     for entry in entries:

@@ -31,12 +31,12 @@ from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import DRAIN_TIMEOUT, WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter, of_settings
-from mems6dof_ros.recording import messages
+from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.source import SOURCES, open_source
 
 #: What tells that a frame has been dealt with, and its type.
-ACKNOWLEDGING = {"localizations": Localizations, "pose_6dof": Pose6DOF}
+ACKNOWLEDGING = {topics.LOCALIZATIONS: Localizations, topics.POSE_6DOF: Pose6DOF}
 
 PARAMETERS = (
     Parameter("source", "simulator", "Where frames come from.", choices=tuple(SOURCES)),
@@ -60,12 +60,12 @@ PARAMETERS = (
         4,
         "Frames in flight with pacing consumer.",
         "frames",
-        (1, transport.FRAME_DEPTH),
+        (1, transport.FRAMES.depth),
         changeable=True,
     ),
     Parameter(
         "acknowledged_by",
-        "localizations",
+        topics.LOCALIZATIONS,
         "Topic that tells that a frame has been dealt with, with pacing consumer.",
         choices=tuple(ACKNOWLEDGING),
     ),
@@ -80,7 +80,7 @@ PARAMETERS = (
     Parameter(
         "at_end", "exit", "What to do after the last frame of a finite source.", choices=("exit", "idle")
     ),
-    replace(WAIT_PARAMETER, default=("image_raw:1",)),
+    replace(WAIT_PARAMETER, default=(f"{topics.IMAGE}:1",)),
     Parameter("simulator.cycles", 0, "Motion cycles to simulate; 0: no end.", "cycles", (0, 2**31 - 1)),
     Parameter(
         "simulator.loop",
@@ -135,16 +135,16 @@ class FrameSourceNode(InstrumentNode):
         self._abandon = False
         self._in_flight: dict[int, float] = {}  # stamp in ns: when published, monotonic s
 
-        few, many = transport.reliable(transport.FRAME_DEPTH), transport.reliable(transport.MESSAGE_DEPTH)
         self._topics: dict[str, Publisher] = {
-            "image_raw": self.create_publisher(Image, "image_raw", few),
-            "frame_info": self.create_publisher(FrameInfo, "frame_info", many),
-            "camera_info": self.create_publisher(CameraInfo, "camera_info", many),
-            "truth": self.create_publisher(GroundTruth, "truth", many),
+            topics.IMAGE: self.create_publisher(Image, topics.IMAGE, transport.FRAMES),
+            topics.FRAME_INFO: self.create_publisher(FrameInfo, topics.FRAME_INFO, transport.MESSAGES),
+            topics.CAMERA_INFO: self.create_publisher(CameraInfo, topics.CAMERA_INFO, transport.MESSAGES),
+            topics.TRUTH: self.create_publisher(GroundTruth, topics.TRUTH, transport.MESSAGES),
         }
         if self.values["pacing"] == "consumer":
             topic = self.values["acknowledged_by"]
-            self.create_subscription(ACKNOWLEDGING[topic], topic, self._on_acknowledged, many, raw=True)
+            kind = ACKNOWLEDGING[topic]
+            self.create_subscription(kind, topic, self._on_acknowledged, transport.MESSAGES, raw=True)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_service(Trigger, "~/step", self._on_step)
@@ -155,13 +155,14 @@ class FrameSourceNode(InstrumentNode):
             f" {'no end' if info.frames is None else f'{info.frames} frames'}"
         )
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
-        self._thread.start()
+        self.when_ready(self.missing_subscribers(self._topics), self._thread.start)
 
     def end(self, spin: Any) -> None:
         with self._changed:
             self._abandon = True
             self._changed.notify_all()
-        self._thread.join(DRAIN_TIMEOUT)
+        if self._thread.is_alive():
+            self._thread.join(DRAIN_TIMEOUT)
         self._source.stop()
         for publisher in self._topics.values():
             publisher.wait_for_all_acked(Duration(seconds=DRAIN_TIMEOUT))
@@ -186,7 +187,6 @@ class FrameSourceNode(InstrumentNode):
 
     def _run(self) -> None:
         try:
-            self.wait_for_subscribers(self._topics, lambda: self._abandon)
             self._set_state(State.RUNNING if self.values["autostart"] else State.STOPPED)
             while self._wait_until_wanted():
                 self._play()
@@ -227,11 +227,11 @@ class FrameSourceNode(InstrumentNode):
             self._in_flight[stamp] = time.monotonic()
         start = time.monotonic()
         frame = replace(frame, published_ns=time.time_ns())
-        self._topics["frame_info"].publish(messages.to_rclpy(messages.frame_info(frame)))
+        self._topics[topics.FRAME_INFO].publish(messages.to_rclpy(messages.frame_info(frame)))
         for truth in messages.ground_truths(frame):
-            self._topics["truth"].publish(messages.to_rclpy(truth))
-        self._topics["camera_info"].publish(messages.to_rclpy(messages.camera_info(frame)))
-        self._topics["image_raw"].publish(image)
+            self._topics[topics.TRUTH].publish(messages.to_rclpy(truth))
+        self._topics[topics.CAMERA_INFO].publish(messages.to_rclpy(messages.camera_info(frame)))
+        self._topics[topics.IMAGE].publish(image)
         self.health.time("publishing", time.monotonic() - start)
         self.health.count("frames")
         if frame.frames_dropped:
@@ -291,9 +291,8 @@ class FrameSourceNode(InstrumentNode):
     def _set_state(self, state: State) -> None:
         with self._changed:
             self._state = state
-            self.health.state = state.name.lower()
             self._changed.notify_all()
-        self.get_logger().info(self.health.state)
+        self.tell(state.name.lower())
 
     def _on_start(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._answer(response, State.RUNNING)

@@ -137,15 +137,16 @@ def of_settings(
         if field.default is dataclasses.MISSING:
             continue
         default = () if field.default is None else field.default
-        unit, doc = (docs or {}).get(field.name) or (field.metadata["unit"], field.metadata["doc"])
+        metadata = field.metadata
+        unit, doc = (docs or {}).get(field.name) or (metadata.get("unit", ""), metadata.get("doc", ""))
         parameters.append(
             Parameter(
                 prefix + field.name,
                 default,
                 doc,
                 unit,
-                span=field.metadata.get("range"),
-                choices=field.metadata.get("choices", ()),
+                span=metadata.get("range"),
+                choices=metadata.get("choices", ()),
                 element=float,
                 optional=isinstance(default, float) and math.isnan(default),
             )

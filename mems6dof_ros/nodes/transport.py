@@ -29,9 +29,19 @@ _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILE
 #: Environment of processes that talk only to processes on this machine.
 LOCALHOST_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
-#: Messages that a publisher keeps for readers who are behind, and readers before they take them.
-FRAME_DEPTH = 10
-MESSAGE_DEPTH = 100
+
+def _reliable(depth: int) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+#: Quality of service of images, and of everything else: reliable, as much kept as the segment holds.
+FRAMES = _reliable(10)
+MESSAGES = _reliable(100)
 
 
 def use_profile(*, frames: bool) -> str:
@@ -62,16 +72,6 @@ def use_profile(*, frames: bool) -> str:
     for name in _PROFILE_VARIABLES:
         os.environ[name] = str(profile)
     return warning
-
-
-def reliable(depth: int) -> QoSProfile:
-    """Quality of service of every topic here: reliable, the last ``depth`` messages kept."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
 
 
 def stamp_of(data: bytes) -> int:

@@ -1,0 +1,281 @@
+"""``localizer``: frames to particles in three dimensions.
+
+Subscribes to ``image_raw`` and, where somebody publishes it, ``frame_info``; publishes ``localizations``,
+and ``localizations/points`` (sensor_msgs/PointCloud2) while somebody listens. Every frame gives one
+message: an empty one where the frame cannot be used, so that nobody waits for it in vain.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from sensor_msgs.msg import Image, PointCloud2, PointField
+
+from mems6dof_msgs.msg import FrameInfo
+from mems6dof_msgs.msg import Localizations as LocalizationsMessage
+from mems6dof_ros.calibration.estimator import METHODS
+from mems6dof_ros.calibration.file import load_calibration
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import NAN, Frame
+from mems6dof_ros.localization.camera import CameraNoise
+from mems6dof_ros.localization.detection import DetectionSettings
+from mems6dof_ros.localization.fitting import WEIGHTINGS
+from mems6dof_ros.localization.localizations import FIT_PARAMETERS, GaussianFits, Latency, Localizations
+from mems6dof_ros.localization.localizer import Localizer, LocalizerSettings
+from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
+from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
+from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.recording import messages, topics
+
+POINTS = "localizations/points"
+
+_DETECTION = {
+    "binning": ("px", "Side of one cell of the image that detection works on."),
+    "spot_sigmas_px": ("px", "Sizes of spots to look for, standard deviations."),
+    "threshold": ("1", "Least contrast of a spot, in standard deviations of the filtered background."),
+    "separation_px": ("px", "Of two candidates closer than this only the brighter stays."),
+    "background_px": ("px", "Size over which the background may vary, several times that of a spot."),
+}
+_SETTINGS = {
+    "weighting": ("", f"Weights of the fit where no calibration prescribes them: {', '.join(WEIGHTINGS)}."),
+    "window_px": ("px", "Odd side of the fitted window where no calibration prescribes it."),
+    "pixel_size": ("m", "Image pixel size in object space where neither calibration nor frame states it."),
+    "neighbour_distance": ("m", "Particles closer than this disturb each other and are flagged."),
+    "neighbour_flux": ("1", "Fraction of a particle's light from which a neighbour disturbs it."),
+    "least_significance": ("1", "Least amplitude in its standard deviations, else flagged as a poor fit."),
+    "most_sigma": ("1", "Greatest width as a fraction of the window, else flagged as a poor fit."),
+    "most_misfit": ("1", "Greatest rms residual beyond noise as a fraction of the light, else a poor fit."),
+}
+_CAMERA = {
+    "offset_adu": ("ADU", "Pixel value without light"),
+    "gain_adu_per_electron": ("ADU/electron", "Gain"),
+    "read_noise_electrons": ("electrons", "Standard deviation of what is not photon noise"),
+    "saturation_adu": ("ADU", "Pixel value from which a pixel is saturated"),
+}
+
+PARAMETERS = (
+    Parameter("calibration", "", "Calibration file; empty: x and y only, no z."),
+    Parameter(
+        "method",
+        "",
+        f"How z is read from the calibration: {', '.join(METHODS)}; empty: as the file says.",
+        choices=("", *METHODS),
+    ),
+    *QUEUE_PARAMETERS,
+    WAIT_PARAMETER,
+    *(
+        Parameter(f"camera.{name}", NAN, f"{doc}, in place of the calibration's.", unit, optional=True)
+        for name, (unit, doc) in _CAMERA.items()
+    ),
+    *of_settings(LocalizerSettings, "", _SETTINGS),
+    *of_settings(DetectionSettings, "detection.", _DETECTION),
+)
+
+
+class LocalizerNode(InstrumentNode):
+    """Localizer behind a queue."""
+
+    def __init__(self) -> None:
+        super().__init__("localizer", PARAMETERS)
+        self._localizer = make_localizer(self.values)
+        self._matcher = FrameMatcher()
+        self._count = 0
+        self._last_counter: int | None = None
+        self._compiled = threading.Event()
+        self._localizations = self.create_publisher(
+            LocalizationsMessage, topics.LOCALIZATIONS, transport.MESSAGES
+        )
+        self._points = self.create_publisher(PointCloud2, POINTS, transport.FRAMES)
+        self.start_worker(self._localize)
+        calibration = self._localizer.calibration
+        self.get_logger().info(
+            f"calibration {calibration.calibration_id}, method {calibration.method}"
+            if calibration
+            else "no calibration: x and y only"
+        )
+        threading.Thread(target=self._compile, name="compile", daemon=True).start()
+        missing = self.missing_subscribers({topics.LOCALIZATIONS: self._localizations})
+        self.when_ready(
+            lambda: missing() if self._compiled.is_set() else "the compiler of the fits", self._subscribe
+        )
+
+    def _compile(self) -> None:
+        """Localize one particle that nobody sees: the first frame must not wait for the compiler."""
+        try:
+            calibration = self._localizer.calibration
+            width, height = calibration.image_size if calibration else (256, 256)
+            camera = self._localizer.camera
+            y, x = np.indices((height, width)) - np.array([height // 2, width // 2])[:, None, None]
+            spot = 1000 * np.exp(-(x**2 + y**2) / (2 * 3.0**2)) + 10
+            level = np.clip(camera.offset_adu + camera.gain_adu_per_electron * spot, 0, 65535)
+            pixel_size = calibration.pixel_size if calibration else 1e-7
+            self._localizer.localize(Frame(level.astype(np.uint16), 0, 0, 0, pixel_size=pixel_size))
+        except InputError:
+            pass  # a frame will tell
+        except Exception as error:  # handed to the main thread, which ends the node
+            self.failure = error
+        self._compiled.set()
+
+    def _subscribe(self) -> None:
+        self.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES)
+        self.create_subscription(Image, topics.IMAGE, self._on_image, transport.FRAMES)
+        self.create_timer(0.1, self._forward, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.tell("ready")
+
+    def _on_info(self, info: FrameInfo) -> None:
+        self._matcher.add_info(messages.nanoseconds(info.header.stamp), info)
+        self._forward()
+
+    def _on_image(self, image: Image) -> None:
+        self._matcher.add_image(messages.nanoseconds(image.header.stamp), image, time.time_ns())
+        self._forward()
+
+    def _forward(self) -> None:
+        """Hand on what is complete."""
+        assert self.worker is not None
+        expected = self.count_publishers(topics.FRAME_INFO) > 0
+        for arrived in self._matcher.take(time.time_ns(), expected):
+            if arrived.info is None and expected:
+                self.health.count("frames without frame_info")
+            self.worker.put(arrived)
+
+    # The worker ---------------------------------------------------------------------------------
+
+    def _localize(self, arrived: ArrivedFrame) -> None:
+        begin_ns = time.time_ns()
+        counter, cycle, lost = self._account(arrived.info)
+        try:
+            frame = messages.to_frame(arrived.image, arrived.info)
+            found = self._localizer.localize(replace(frame, frame_counter=counter, cycle=cycle))
+        except InputError as error:
+            self.health.refused(str(error))
+            found = _nothing(arrived, counter, cycle)
+        published_ns = time.time_ns()
+        found = replace(
+            found,
+            frames_dropped=lost,
+            latency=_latency(arrived, begin_ns, published_ns),
+            published_ns=published_ns,
+        )
+        self._localizations.publish(messages.to_rclpy(messages.localizations(found)))
+        if self._points.get_subscription_count():
+            self._points.publish(point_cloud(found))
+        self.health.count("frames")
+        self.health.set("particles", len(found))
+        self.health.time("localization", found.latency.localization)
+        self.health.time("waiting in the queue", found.latency.queue)
+
+    def _account(self, info: FrameInfo | None) -> tuple[int, int, int]:
+        """Frame counter, motion cycle, and frames lost since the last frame."""
+        dropped = self.worker.dropped if self.worker else 0
+        if info is None:
+            # A camera that publishes only images: count ourselves, one motion cycle per frame.
+            counter = cycle = self._count + dropped
+            self._count += 1
+        else:
+            counter, cycle = int(info.frame_counter), int(info.cycle)
+        last, self._last_counter = self._last_counter, counter
+        lost = counter - last - 1 if last is not None and counter > last else 0
+        on_the_way = lost - (info.frames_dropped if info else 0)
+        if on_the_way > 0:
+            self.health.lost(
+                on_the_way,
+                f"{on_the_way} frames lost before frame {counter} ({dropped} in this queue so far)",
+            )
+        return counter, cycle, lost
+
+
+def make_localizer(values: Mapping[str, Any]) -> Localizer:
+    """The localizer that the parameters describe; InputError where they cannot work together."""
+    path, method = values["calibration"], values["method"]
+    calibration = load_calibration(path, method or None) if path else None
+    given = {name: values[f"camera.{name}"] for name in _CAMERA if not math.isnan(values[f"camera.{name}"])}
+    if calibration:
+        camera = replace(calibration.camera, **given)
+    elif missing := [name for name in _CAMERA if name not in given]:
+        raise InputError(
+            f"parameter camera.{missing[0]}", "neither a value nor a calibration", "one of the two"
+        )
+    else:
+        camera = CameraNoise(**given)
+    detection = to_settings(DetectionSettings, "detection.", values)
+    return Localizer(camera, calibration, to_settings(LocalizerSettings, "", values, detection=detection))
+
+
+def point_cloud(found: Localizations) -> PointCloud2:
+    """Positions as float32 in m, with flux in electrons and flags."""
+    kinds = {"x": "<f4", "y": "<f4", "z": "<f4", "flux": "<f4", "flags": "<u4"}
+    points = np.empty(len(found), dtype=list(kinds.items()))
+    points["x"], points["y"], points["z"] = found.position.T
+    points["flux"], points["flags"] = found.fits.flux, found.flags
+    cloud = PointCloud2(height=1, width=len(found), point_step=20, row_step=20 * len(found), is_dense=False)
+    cloud.header = messages.to_rclpy(messages.header(found.stamp_ns, found.frame_id))
+    cloud.fields = [
+        PointField(
+            name=name,
+            offset=4 * k,
+            datatype=PointField.UINT32 if kind == "<u4" else PointField.FLOAT32,
+            count=1,
+        )
+        for k, (name, kind) in enumerate(kinds.items())
+    ]
+    cloud.data.frombytes(points.tobytes())
+    return cloud
+
+
+def _latency(arrived: ArrivedFrame, begin_ns: int, published_ns: int) -> Latency:
+    capture = transported = NAN
+    if arrived.info is not None:
+        frame_published_ns = messages.nanoseconds(arrived.info.publication_time)
+        transported = (arrived.arrival_ns - frame_published_ns) * 1e-9
+        if arrived.info.live:
+            capture = (frame_published_ns - messages.nanoseconds(arrived.info.header.stamp)) * 1e-9
+    return Latency(
+        capture=capture,
+        frame_transport=transported,
+        queue=(begin_ns - arrived.arrival_ns) * 1e-9,
+        localization=(published_ns - begin_ns) * 1e-9,
+    )
+
+
+def _nothing(arrived: ArrivedFrame, counter: int, cycle: int) -> Localizations:
+    """No particles, for a frame that cannot be used."""
+    header = arrived.image.header
+    fits = GaussianFits(
+        parameters=np.empty((0, len(FIT_PARAMETERS))),
+        covariance=np.empty((0, len(FIT_PARAMETERS), len(FIT_PARAMETERS))),
+        chi_square=np.empty(0),
+        iterations=np.empty(0, np.int32),
+        flags=np.empty(0, np.uint32),
+    )
+    return Localizations(
+        stamp_ns=messages.nanoseconds(header.stamp),
+        frame_id=header.frame_id,
+        frame_counter=counter,
+        cycle=cycle,
+        position=np.empty((0, 3)),
+        covariance=np.empty((0, 3, 3)),
+        fits=fits,
+        z_gap=np.empty(0),
+        flags=np.empty(0, np.uint32),
+        frame_published_ns=messages.nanoseconds(arrived.info.publication_time) if arrived.info else 0,
+    )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns the exit status."""
+    transport.keep_large_buffers()
+    return run(LocalizerNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""``pose_estimator``: particles to the pose of the gear, once per motion cycle.
+
+Subscribes to ``localizations``; publishes ``pose_6dof`` for every one of them, and ``pose`` and
+``pose_with_covariance`` while the pose is valid, all with the header of the frame. Services
+(std_srvs/Trigger): ``~/reset``, ``~/set_reference``.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from dataclasses import replace
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from std_srvs.srv import Trigger
+
+from mems6dof_msgs.msg import Localizations as LocalizationsMessage
+from mems6dof_msgs.msg import Pose6DOF
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import NAN
+from mems6dof_ros.localization.localizations import Localizations
+from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
+from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.pose.cycle_pose import CyclePose
+from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings
+from mems6dof_ros.recording import messages, topics
+
+_SETTINGS = {
+    "reference": (
+        "",
+        "What a frame is registered to: map, the constellation map refined as cycles arrive, or previous, the"
+        " micrograph before, as the paper does, whose errors add up.",
+    ),
+    "gates": ("m", "Annealed gates of the iterative closest point, descending."),
+    "min_particles": ("particles", "Fewer matched particles give no pose."),
+    "confirm_after": ("cycles", "Sightings in a row before a newcomer joins the map."),
+    "retire_after": ("cycles", "Misses in a row, where it should be seen, before a particle leaves the map."),
+    "overlap": ("m", "Particles closer than this count less until their residuals prove them good."),
+    "gate_xy": ("1", "Standard deviations in x and y beyond which a particle is left out."),
+    "gate_z": ("1", "Standard deviations in z beyond which the z of a particle is left out."),
+    "max_displacement": ("m", "Farther from its centre of rotation no body moves: the pose is lost."),
+    "max_tilt": ("rad", "Likewise for the tilt."),
+    "max_false_alarms": ("1", "Matches this good that chance gives, log10: the proof against a wrong pose."),
+    "field_size": ("m", "Width and height of the field; empty: taken from where particles are seen."),
+    "field_degree": ("1", "Degree of the smooth field error that is estimated with the map; 0: none."),
+    "field_sd_xy": ("m", "Its prior standard deviation in x and y: what the calibration leaves."),
+    "field_sd_z": ("m", "Likewise in z."),
+    "recentre_at": (
+        "rad",
+        "Turns since the reference at which the origin moves to the centre of rotation as known by then, each"
+        " a new reference version; empty: only ~/set_reference.",
+    ),
+}  # fmt: skip
+
+PARAMETERS = (
+    Parameter("body", "load_gear", "Name of the rigid body in the messages."),
+    *QUEUE_PARAMETERS,
+    WAIT_PARAMETER,
+    *of_settings(PoseSettings, "", _SETTINGS),
+)
+
+
+class PoseEstimatorNode(InstrumentNode):
+    """PoseEstimator behind a queue."""
+
+    def __init__(self) -> None:
+        super().__init__("pose_estimator", PARAMETERS)
+        self._estimator = PoseEstimator(to_settings(PoseSettings, "", self.values), self.values["body"])
+        self._using_estimator = threading.Lock()
+        self._last_counter: int | None = None
+        self._pose_6dof = self.create_publisher(Pose6DOF, topics.POSE_6DOF, transport.MESSAGES)
+        self._pose = self.create_publisher(PoseStamped, topics.POSE, transport.MESSAGES)
+        self._pose_with_covariance = self.create_publisher(
+            PoseWithCovarianceStamped, topics.POSE_WITH_COVARIANCE, transport.MESSAGES
+        )
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/set_reference", self._on_set_reference)
+        self.start_worker(self._estimate)
+        publishers = {
+            topics.POSE_6DOF: self._pose_6dof,
+            topics.POSE: self._pose,
+            topics.POSE_WITH_COVARIANCE: self._pose_with_covariance,
+        }
+        self.when_ready(self.missing_subscribers(publishers), self._subscribe)
+
+    def _subscribe(self) -> None:
+        self.create_subscription(
+            LocalizationsMessage, topics.LOCALIZATIONS, self._on_localizations, transport.MESSAGES
+        )
+        self.tell("ready")
+
+    def _on_localizations(self, message: LocalizationsMessage) -> None:
+        assert self.worker is not None
+        self.worker.put((message, time.time_ns()))
+
+    # The worker ---------------------------------------------------------------------------------
+
+    def _estimate(self, arrived: tuple[LocalizationsMessage, int]) -> None:
+        message, arrival_ns = arrived
+        try:
+            found = messages.to_localizations(message)
+            self._account(found)
+            with self._using_estimator:
+                cycle_pose = self._estimator.update(found)
+        except InputError as error:
+            self.health.refused(str(error))
+            return
+        published_ns = time.time_ns()
+        latency = replace(
+            found.latency,
+            localization_transport=(arrival_ns - found.published_ns) * 1e-9,
+            pose=(published_ns - arrival_ns) * 1e-9,
+            total=(published_ns - found.frame_published_ns) * 1e-9 if found.frame_published_ns else NAN,
+        )
+        self._publish(replace(cycle_pose, latency=latency))
+
+    def _publish(self, cycle_pose: CyclePose) -> None:
+        self._pose_6dof.publish(messages.to_rclpy(messages.pose6dof(cycle_pose)))
+        if cycle_pose.valid:
+            self._pose.publish(messages.to_rclpy(messages.pose_stamped(cycle_pose)))
+            self._pose_with_covariance.publish(
+                messages.to_rclpy(messages.pose_with_covariance_stamped(cycle_pose))
+            )
+        self.health.state = cycle_pose.status.name.lower() + (
+            f": {cycle_pose.reason}" if cycle_pose.reason else ""
+        )
+        self.health.count("poses")
+        self.health.count(f"poses {cycle_pose.status.name.lower()}")
+        self.health.set("particles used", cycle_pose.particles_used)
+        self.health.set("residual xy, nm", f"{cycle_pose.residual_rms_xy * 1e9:.2f}")
+        self.health.set("residual z, nm", f"{cycle_pose.residual_rms_z * 1e9:.1f}")
+        self.health.time("pose", cycle_pose.latency.pose)
+        self.health.time("frame to pose", cycle_pose.latency.total)
+
+    def _account(self, found: Localizations) -> None:
+        """Count the localizations that were lost on the way here."""
+        last, self._last_counter = self._last_counter, found.frame_counter
+        if last is not None and (lost := found.frame_counter - last - 1 - found.frames_dropped) > 0:
+            self.health.lost(lost, f"{lost} localizations lost before frame {found.frame_counter}")
+
+    # Services -----------------------------------------------------------------------------------
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self._using_estimator:
+            self._estimator.reset()
+        response.success, response.message = True, "the next cycle founds a new reference"
+        return response
+
+    def _on_set_reference(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            with self._using_estimator:
+                version = self._estimator.set_reference()
+            response.success, response.message = True, f"reference version {version}"
+        except InputError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns the exit status."""
+    return run(PoseEstimatorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

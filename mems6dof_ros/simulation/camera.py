@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mems6dof_ros.simulation.optics import ParticleImages
 from mems6dof_ros.simulation.settings import SimulationSettings
 
-_MARGIN = 128  # by so many pixels the noise bank is larger than an image
+_MARGIN = 1 / 16  # by so much of the image's smaller side the noise banks are larger than it
 
 
 class Camera:
@@ -24,8 +24,9 @@ class Camera:
     background comes from a bank drawn once, slightly larger than the image, cropped at a random
     place, and the light of particles is drawn only where there is any. Read noise comes likewise
     from a bank of normal numbers, scaled by the map. The price: two frames share background noise
-    shifted by a random vector (one pair in 16 641 unshifted; read noise has its own shift), and the smooth
-    illumination of the background moves along by up to 64 px. ``rng`` draws all noise.
+    shifted by a random vector (of 2048 x 2048 px, one pair in 16 641 unshifted; read noise has its own
+    shift), and the background's smooth illumination moves along by up to 1/32 of the image.
+    ``rng`` draws all noise.
     """
 
     def __init__(self, settings: SimulationSettings, rng: np.random.Generator) -> None:
@@ -45,7 +46,8 @@ class Camera:
         self.read_noise_map = np.float32(settings.read_noise) * np.exp(spread(settings.read_noise_spread))
         self._read_map_adu = self.read_noise_map * self.gain_map
 
-        bank_shape = shape[0] + _MARGIN, shape[1] + _MARGIN
+        self._margin = round(_MARGIN * min(shape))
+        bank_shape = shape[0] + self._margin, shape[1] + self._margin
         mean = settings.background * illumination_map(bank_shape, settings)
         self._background = rng.poisson(mean).astype(np.uint16)
         self._read = rng.standard_normal(bank_shape, dtype=np.float32)
@@ -65,7 +67,7 @@ class Camera:
             part = window[rows.start - row : rows.stop - row, columns.start - column : columns.stop - column]
             self._signal[rows, columns] += self._rng.poisson(part).astype(np.int32)
             touched.append((rows, columns))
-        by, bx, ry, rx = self._rng.integers(0, _MARGIN + 1, 4)
+        by, bx, ry, rx = self._rng.integers(0, self._margin + 1, 4)
         digital = np.empty((height, width), self._dtype)
         _digitize(
             self._background[by : by + height, bx : bx + width],

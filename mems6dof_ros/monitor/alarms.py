@@ -1,0 +1,78 @@
+"""Alarms on limits that the user sets, judged on every cycle and not only on those drawn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.monitor.history import COLUMNS
+from mems6dof_ros.pose.cycle_pose import DEGREES_OF_FREEDOM
+
+#: What limits may be set on: columns of the history.
+QUANTITIES = (
+    *DEGREES_OF_FREEDOM,
+    "rotation_per_cycle",
+    "beta",
+    "residual_rms_xy",
+    "residual_rms_z",
+    "chi_square",
+    "particles_used",
+    "latency_total",
+)
+_COLUMN = {name: index for index, name in enumerate(COLUMNS)}
+
+
+@dataclass
+class Limit:
+    """Allowed range of one quantity, SI units, and how it has been kept.
+
+    ``active``: the last value is outside; ``count``: cycles outside since the limit was set.
+    """
+
+    quantity: str
+    low: float
+    high: float
+    active: bool = False
+    count: int = 0
+
+    def __post_init__(self) -> None:
+        if self.quantity not in QUANTITIES:
+            raise InputError("limit", f"quantity {self.quantity!r}", f"one of {', '.join(QUANTITIES)}")
+        if not self.low <= self.high:
+            raise InputError(f"limit on {self.quantity}", f"{self.low} to {self.high}", "low <= high")
+
+
+@dataclass
+class Alarms:
+    """At most one limit per quantity."""
+
+    limits: dict[str, Limit] = field(default_factory=dict)
+
+    def set(self, limit: Limit) -> None:
+        """Set, or replace, the limit of a quantity and start counting anew."""
+        self.limits[limit.quantity] = limit
+
+    def remove(self, quantity: str) -> None:
+        """Drop the limit of a quantity, if there is one."""
+        self.limits.pop(quantity, None)
+
+    def judge(self, row: NDArray[np.float64]) -> list[tuple[Limit, float]]:
+        """Limits that this row of the history has begun or ceased to violate, with its values.
+
+        A NaN is no value and changes nothing: that tracking is lost is told elsewhere.
+        """
+        changed = []
+        for limit in self.limits.values():
+            value = float(row[_COLUMN[limit.quantity]])
+            if math.isnan(value):
+                continue
+            outside = not limit.low <= value <= limit.high
+            limit.count += outside
+            if outside != limit.active:
+                limit.active = outside
+                changed.append((limit, value))
+        return changed

@@ -1,0 +1,295 @@
+"""``monitor``: the live page, in any browser on this machine.
+
+Subscribes to everything that the instrument says, serves the page and calls the services that the page
+asks for. With nobody looking it only keeps numbers; docs/monitor.md has the rest.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import Empty, Queue
+from typing import Any, TypeVar
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+
+from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import GroundTruth as Truth
+from mems6dof_ros.monitor.feed import Feed
+from mems6dof_ros.monitor.picture import make_picture
+from mems6dof_ros.monitor.server import MonitorServer
+from mems6dof_ros.monitor.truth import TruthAlignment
+from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.common import InstrumentNode, run
+from mems6dof_ros.nodes.parameters import Parameter
+from mems6dof_ros.pose.cycle_pose import CyclePose
+from mems6dof_ros.recording import messages, topics
+
+PARAMETERS = (
+    Parameter("address", "127.0.0.1", "Address to listen on; other than localhost, a token is asked for."),
+    Parameter("port", 8606, "TCP port to listen on; 0: any free one.", span=(0, 65535)),
+    Parameter("history", 30000, "Motion cycles that the page can show.", "cycles", (100, 1_000_000)),
+    Parameter(
+        "picture_rate", 4.0, "Micrographs shown per second while a page is open; 0: none.", "Hz", (0.0, 30.0)
+    ),
+)
+#: Services that the page may call, relative names; all std_srvs/Trigger.
+SERVICES = (
+    "frame_source/start",
+    "frame_source/stop",
+    "frame_source/step",
+    "pose_estimator/set_reference",
+    "pose_estimator/reset",
+    "recorder/start",
+    "recorder/stop",
+)
+#: Environment variable with the token to ask for; a parameter could be read by everybody on the network.
+TOKEN_VARIABLE = "MEMS6DOF_MONITOR_TOKEN"
+
+_RATES = (topics.FRAME_INFO, topics.LOCALIZATIONS, topics.POSE_6DOF)
+_MEMORY_FRAMES = 64  # frames whose messages are kept until the picture of one of them is made
+_STATE_PERIOD = 0.5  # s
+_PICTURE_PATIENCE = 0.5  # s that a picture waits for its pose
+_STANDSTILL = 10.0  # s without a frame after which none are expected
+_NO_IMAGES = 1.5  # s without an image after which there are none
+_MAX_DIAGNOSTICS = 32
+
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+
+
+class _Recent(OrderedDict[_Key, _Value]):
+    """The last few values by key."""
+
+    def __setitem__(self, key: _Key, value: _Value) -> None:
+        super().__setitem__(key, value)
+        while len(self) > _MEMORY_FRAMES:
+            self.popitem(last=False)
+
+
+class MonitorNode(InstrumentNode):
+    """Feeds and serves the live page."""
+
+    def __init__(self) -> None:
+        super().__init__("monitor", PARAMETERS)
+        self._feed = Feed(self.values["history"], log=lambda text: self._warn(f"alarm: {text}"))
+        self._server = MonitorServer(
+            self._feed,
+            self._call,
+            address=self.values["address"],
+            port=self.values["port"],
+            token=os.environ.get(TOKEN_VARIABLE, ""),
+            log=self._warn,
+        )
+        self._counts: Counter[str] = Counter()
+        self._counted_at = time.monotonic()
+        self._frames_dropped = 0
+        self._heard_at = -_STANDSTILL  # of a frame, monotonic s
+        self._newest: CyclePose | None = None
+        self._newest_at = 0.0  # monotonic s
+        self._diagnostics: OrderedDict[str, dict[str, Any]] = OrderedDict()
+        self._truths: _Recent[tuple[int, str], Truth] = _Recent()
+        self._alignments: dict[str, TruthAlignment] = {}
+        self._poses: _Recent[int, list[CyclePose]] = _Recent()
+        self._found: _Recent[int, bytes] = _Recent()
+        self._infos: _Recent[int, FrameInfo] = _Recent()
+        self._image: Any = None  # the subscription, while an image is waited for
+        self._images: Queue[bytes | None] = Queue(maxsize=1)
+        self._painter = threading.Thread(target=self._paint, name="painter", daemon=True)
+
+        def subscribe(kind: type, topic: str, callback: Callable[..., None], raw: bool = False) -> None:
+            self.create_subscription(kind, topic, callback, transport.MESSAGES, raw=raw)
+
+        subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
+        # Raw: only the few that are drawn are ever decoded.
+        subscribe(Localizations, topics.LOCALIZATIONS, self._on_localizations, raw=True)
+        subscribe(FrameInfo, topics.FRAME_INFO, self._on_frame_info)
+        subscribe(GroundTruth, topics.TRUTH, self._on_truth)
+        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics)
+        self._triggers = {name: self.create_client(Trigger, name) for name in SERVICES}
+        # Wall time: the page lives also while simulated time stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_STATE_PERIOD, self._tell_state, clock=steady)
+        if rate := self.values["picture_rate"]:
+            self.create_timer(1 / rate, self._ask_for_image, clock=steady)
+
+        self._painter.start()
+        self.tell(f"live page: {self._server.start()}")
+        self.health.gauge("pages with pictures", lambda: self._feed.watchers)
+
+    def end(self, spin: Callable[[float], None]) -> None:
+        self._server.stop()
+        self._images.put(None)
+        self._painter.join(timeout=2)
+        super().end(spin)
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+    # What is heard ------------------------------------------------------------------------------
+
+    def _on_pose(self, message: Pose6DOF) -> None:
+        self._counts[topics.POSE_6DOF] += 1
+        try:
+            pose = messages.to_cycle_pose(message)
+        except InputError as error:
+            self._feed.tell("warning", str(error))
+            return
+        self._feed.add_pose(pose, self._true_displacement(pose))
+        self._poses.setdefault(pose.stamp_ns, []).append(pose)
+        self._newest, self._newest_at = pose, time.monotonic()
+
+    def _on_localizations(self, data: bytes) -> None:
+        self._counts[topics.LOCALIZATIONS] += 1
+        self._heard_at = time.monotonic()
+        self._found[transport.stamp_of(data)] = data
+
+    def _on_frame_info(self, message: FrameInfo) -> None:
+        self._counts[topics.FRAME_INFO] += 1
+        self._heard_at = time.monotonic()
+        self._frames_dropped += message.frames_dropped
+        self._infos[messages.nanoseconds(message.header.stamp)] = message
+
+    def _on_truth(self, message: GroundTruth) -> None:
+        self._truths[messages.nanoseconds(message.header.stamp), message.body] = messages.to_ground_truth(
+            message
+        )
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._diagnostics[status.name] = {
+                "name": status.name,
+                "level": int.from_bytes(status.level, "little"),
+                "message": status.message,
+                "values": {pair.key: pair.value for pair in status.values[:32]},
+            }
+            while len(self._diagnostics) > _MAX_DIAGNOSTICS:
+                self._diagnostics.popitem(last=False)
+
+    def _true_displacement(self, pose: CyclePose) -> NDArray[np.float64] | None:
+        truth = self._truths.get((pose.stamp_ns, pose.body))
+        if truth is None or not pose.valid:
+            return None
+        alignment = self._alignments.get(pose.body)
+        if alignment is None or alignment.reference_version != pose.reference_version:
+            alignment = self._alignments[pose.body] = TruthAlignment(pose, truth)
+        return alignment.displacement(truth)
+
+    def _tell_state(self) -> None:
+        now = time.monotonic()
+        elapsed, self._counted_at = now - self._counted_at, now
+        rates = {name: self._counts[name] / elapsed for name in _RATES}
+        self._counts.clear()
+        self._feed.set_instrument(
+            {
+                "rates": {name: round(rate, 1) for name, rate in rates.items()},
+                "stale": round(now - self._newest_at, 1) if self._newest else None,
+                "frames_dropped": self._frames_dropped,
+                "aligned_at": {body: alignment.cycle for body, alignment in self._alignments.items()},
+                "services": {name: client.service_is_ready() for name, client in self._triggers.items()},
+                "diagnostics": list(self._diagnostics.values()),
+            }
+        )
+
+    # Pictures -----------------------------------------------------------------------------------
+
+    def _ask_for_image(self) -> None:
+        """Subscribe to images until the next one has come.
+
+        A standing subscription would carry every frame across DDS once more, which takes a good part
+        of a processor at 90 frames/s and slows the measurement; one that lives for one frame does not.
+        Nor must it be taken for the localizer by a source that waits for somebody to listen, hence
+        nothing happens before frames flow.
+        """
+        flowing = time.monotonic() - self._heard_at < _STANDSTILL
+        if flowing and self._feed.watchers and self._image is None and self._images.empty():
+            self._image = self.create_subscription(
+                Image, topics.IMAGE, self._on_image, transport.FRAMES, raw=True
+            )
+
+    def _on_image(self, data: bytes) -> None:
+        if self._image is not None:
+            self.destroy_subscription(self._image)
+            self._image = None
+            self._images.put(data)
+
+    def _paint(self) -> None:
+        """Make pictures, in a thread of its own, until None comes; without images, of points only."""
+        patience = _NO_IMAGES
+        try:
+            while True:
+                try:
+                    data = self._images.get(timeout=patience)
+                    patience = _NO_IMAGES
+                except Empty:
+                    data, patience = b"", _STATE_PERIOD
+                if data is None:
+                    return
+                if self._feed.watchers:
+                    self._paint_one(data)
+        except Exception as error:  # handed to the main thread, which ends the node
+            self.failure = error
+
+    def _paint_one(self, data: bytes) -> None:
+        if data:
+            stamp = transport.stamp_of(data)
+        elif self._newest:
+            stamp = self._newest.stamp_ns
+        else:
+            return
+        deadline = time.monotonic() + _PICTURE_PATIENCE
+        while time.monotonic() < deadline and not (stamp in self._found and stamp in self._poses):
+            time.sleep(0.02)
+        info, found = self._infos.get(stamp), self._found.get(stamp)
+        try:
+            picture = make_picture(
+                messages.to_frame(deserialize_message(data, Image), info) if data else None,
+                messages.to_localizations(deserialize_message(found, Localizations)) if found else None,
+                self._poses.get(stamp, []),
+                self._feed.bodies,
+            )
+        except InputError as error:
+            self._feed.tell("warning", str(error))
+        else:
+            self._feed.add_picture(picture)
+
+    # What the page asks for ---------------------------------------------------------------------
+
+    def _call(self, service: str) -> Future[tuple[bool, str]]:
+        """Call a service from the server's thread."""
+        client = self._triggers[service]
+        answer: Future[tuple[bool, str]] = Future()
+        if not client.service_is_ready():
+            answer.set_result((False, "nobody offers this service now"))
+            return answer
+        pending = client.call_async(Trigger.Request())
+
+        def on_response(done: Any) -> None:
+            response = done.result()
+            if answer.set_running_or_notify_cancel():
+                answer.set_result((response.success, response.message))
+
+        pending.add_done_callback(on_response)
+        answer.add_done_callback(lambda _: client.remove_pending_request(pending))
+        return answer
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns the exit status."""
+    return run(MonitorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -214,7 +214,7 @@ def _honesty(count: int, seed: int) -> list[Figure]:
         ratio = np.sqrt(np.mean(np.divide(claimed, actual), axis=0))
         for k, name in enumerate(("x", "y", "ln sigma_x", "ln sigma_y", "rho")):
             quantity = f"physical images, {electrons:.0e} electrons: claimed / actual sd({name})"
-            table.append(_figure(quantity, ratio[k], 0.85, 1.15))
+            table.append(_figure(quantity, ratio[k], 0.93, 1.07))
     return table
 
 

@@ -10,7 +10,7 @@ particle and the particle itself cause.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,15 +61,8 @@ _SMOOTH = Preset(
 PRESETS: dict[str, Preset] = {
     "ideal": Preset(),
     "smooth": _SMOOTH,
-    "paper": Preset(**{**_SMOOTH.__dict__, "local_astigmatism": 2e-9}),
-    "sign_change": Preset(
-        **{
-            **_SMOOTH.__dict__,
-            "astigmatism": 0.07 + 0j,
-            "astigmatism_linear": 0.05,
-            "local_astigmatism": 2e-9,
-        }
-    ),
+    "paper": replace(_SMOOTH, local_astigmatism=2e-9),
+    "sign_change": replace(_SMOOTH, astigmatism=0.07, astigmatism_linear=0.05, local_astigmatism=2e-9),
 }
 
 _LOCAL_CORRELATION = 5e-6

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 
@@ -54,3 +55,10 @@ def test_every_field_is_described():
         assert spec.metadata["doc"]
         assert "unit" in spec.metadata
         assert ("range" in spec.metadata) != ("choices" in spec.metadata)
+
+
+def test_the_documentation_names_every_setting_with_its_default():
+    text = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    for spec in dataclasses.fields(SimulationSettings):
+        default = f"{spec.default:.6g}" if isinstance(spec.default, float) else str(spec.default)
+        assert f"| `{spec.name}` | {default} |" in text

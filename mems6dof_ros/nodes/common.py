@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import signal
 import statistics
 import sys
@@ -25,6 +27,9 @@ from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.parameters import Parameter, declare
 
 Item = TypeVar("Item")
+
+#: Environment variable by which the runner tells a node its process id.
+PARENT_VARIABLE = "MEMS6DOF_PARENT"
 
 #: Seconds that the end of a node may take: for what is queued, then for what readers have not yet taken.
 DRAIN_TIMEOUT = 3.0
@@ -306,6 +311,7 @@ def run(create: Callable[[], InstrumentNode], args: list[str] | None = None, *, 
     0: ended in good order, what was queued finished; a second signal ends at once. 1: refused to start or
     failed, with one line that says why. ``frames``: the node publishes images.
     """
+    _die_with_parent()
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -336,6 +342,16 @@ def run(create: Callable[[], InstrumentNode], args: list[str] | None = None, *, 
     finally:
         rclpy.try_shutdown()
     return 0
+
+
+def _die_with_parent() -> None:
+    """Be told by SIGTERM when the runner that started this process is gone, even when it was killed."""
+    parent = os.environ.pop(PARENT_VARIABLE, None)
+    if parent and sys.platform == "linux":
+        set_parent_death_signal = 1  # prctl.h
+        ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)
+        if os.getppid() != int(parent):  # it died before we asked
+            sys.exit(1)
 
 
 def _spin(node: InstrumentNode, stop: threading.Event) -> None:

@@ -218,7 +218,7 @@ def _refuse_unknown(node: Node, known: Mapping[str, Parameter]) -> None:
             raise InputError("parameters", f"unknown '{name}'", hint)
 
 
-def as_yaml(title: str, parameters: Iterable[Parameter]) -> str:
+def asto_yaml(title: str, parameters: Iterable[Parameter]) -> str:
     """A parameter file with every parameter at its default, under ``/**:``, commented."""
     lines = [f"# {line}" for line in textwrap.wrap(title, 98)] + ["/**:", "  ros__parameters:"]
     section: tuple[str, ...] = ()
@@ -233,11 +233,12 @@ def as_yaml(title: str, parameters: Iterable[Parameter]) -> str:
             notes.append("may be changed while running")
         doc = parameter.doc + (f" ({'; '.join(notes)})" if notes else "")
         lines += [f"{indent}# {line}" for line in textwrap.wrap(doc, 102 - len(indent))]
-        lines.append(f"{indent}{name}: {_yaml(parameter.default)}")
+        lines.append(f"{indent}{name}: {to_yaml(parameter.default)}")
     return "\n".join(lines) + "\n"
 
 
-def _yaml(value: Value) -> str:
+def to_yaml(value: Value) -> str:
+    """A value as YAML that ROS 2 reads back with its type."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -245,7 +246,7 @@ def _yaml(value: Value) -> str:
     if isinstance(value, str):
         return f'"{value}"'
     if isinstance(value, Sequence):
-        return f"[{', '.join(map(_yaml, value))}]"
+        return f"[{', '.join(map(to_yaml, value))}]"
     return str(value)
 
 

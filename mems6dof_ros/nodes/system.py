@@ -1,0 +1,369 @@
+"""Systems of nodes as plain data, and a runner that starts them where `launch` is missing.
+
+A ``System`` has the arguments of a launch file and a function from their values to a table of nodes; the
+files in ``launch_scripts/`` hand the same tables to `launch`. From a shell, with the arguments of
+``ros2 launch``::
+
+    python -m mems6dof_ros.nodes.system replay bag:=recording calibration:=optics.yaml
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mems6dof_ros.errors import InputError, Mems6dofError
+from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.common import PARENT_VARIABLE, WAIT_PARAMETER
+from mems6dof_ros.nodes.parameters import to_yaml
+from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
+from mems6dof_ros.recording import topics
+
+#: What each node publishes and can be told to hold back until somebody listens.
+_PUBLISHED = {
+    "frame_source": (topics.IMAGE, topics.FRAME_INFO, topics.CAMERA_INFO, topics.TRUTH),
+    "localizer": (topics.LOCALIZATIONS,),
+    "pose_estimator": (topics.POSE_6DOF, topics.POSE, topics.POSE_WITH_COVARIANCE),
+}
+_SUBSCRIBED = {
+    "localizer": (topics.IMAGE, topics.FRAME_INFO),
+    "pose_estimator": (topics.LOCALIZATIONS,),
+}
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """One node of a system: ``executable`` of this package, with its parameters and remappings.
+
+    ``ends_system``: when this process ends, the others have nothing left to do.
+    """
+
+    executable: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    remappings: Mapping[str, str] = field(default_factory=dict)
+    ends_system: bool = False
+
+
+@dataclass(frozen=True)
+class System:
+    """``arguments``: name to default and description, as texts; ``nodes``: from their values to the table,
+    in the order in which frames flow, which is also the order in which the nodes are stopped."""
+
+    doc: str
+    arguments: Mapping[str, tuple[str, str]]
+    nodes: Callable[[Mapping[str, str]], list[NodeSpec]]
+
+    def table(self, values: Mapping[str, str]) -> list[NodeSpec]:
+        """The nodes for ``values``, defaults for the rest; InputError for an unknown argument."""
+        for name in values:
+            if name not in self.arguments:
+                raise InputError("arguments", f"'{name}'", f"one of {', '.join(self.arguments)}")
+        return self.nodes({**{name: default for name, (default, _) in self.arguments.items()}, **values})
+
+
+# Tables ------------------------------------------------------------------------------------------
+
+
+def chain(
+    source: NodeSpec | None,
+    *,
+    calibration: str,
+    output: str = "",
+    queue_policy: str = "block",
+    image_topic: str = topics.IMAGE,
+    recorded: Sequence[str] = DEFAULT_TOPICS,
+) -> list[NodeSpec]:
+    """frame_source, localizer, pose_estimator and, with an ``output``, recorder.
+
+    ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for
+    the subscribers that the table gives it, so that nothing is lost at the beginning.
+    """
+    queue = {"queue_policy": queue_policy}
+    remap = {topics.IMAGE: image_topic} if image_topic != topics.IMAGE else {}
+    nodes = [source] if source else []
+    nodes.append(NodeSpec("localizer", {"calibration": calibration, **queue}, remap))
+    nodes.append(NodeSpec("pose_estimator", queue))
+    if output:
+        attachments = {"attachments": [calibration]} if calibration else {}
+        recorder = {"output": output, "topics": list(recorded), **attachments}
+        nodes.append(NodeSpec("recorder", recorder, remap))
+    return [_waiting_for_subscribers(node, nodes) for node in nodes]
+
+
+def simulated(cycles: int, **settings: Any) -> NodeSpec:
+    """A frame_source that simulates ``cycles`` and ends when all of them have become poses."""
+    options = {f"simulator.{name}": value for name, value in settings.items()}
+    return _finite("simulator", {"simulator.cycles": cycles, **options})
+
+
+def replayed(bag: str, topic: str = "") -> NodeSpec:
+    """A frame_source that replays a bag and ends when all of it has become poses."""
+    return _finite("bag", {"bag.path": bag, "bag.topic": topic})
+
+
+def _finite(kind: str, options: Mapping[str, Any]) -> NodeSpec:
+    pacing = {"pacing": "consumer", "acknowledged_by": topics.POSE_6DOF}
+    return NodeSpec("frame_source", {"source": kind, **pacing, **options}, ends_system=True)
+
+
+def _waiting_for_subscribers(node: NodeSpec, nodes: Sequence[NodeSpec]) -> NodeSpec:
+    subscribed = [topic for other in nodes for topic in _subscriptions(other)]
+    waits = [
+        f"{topic}:{subscribed.count(topic)}"
+        for topic in _PUBLISHED.get(node.executable, ())
+        if topic in subscribed
+    ]
+    return replace(node, parameters={**node.parameters, WAIT_PARAMETER.name: waits}) if waits else node
+
+
+def _subscriptions(node: NodeSpec) -> Sequence[str]:
+    if node.executable == "recorder":
+        return list(node.parameters["topics"])
+    if node.executable == "frame_source":
+        return [node.parameters["acknowledged_by"]] if node.parameters["pacing"] == "consumer" else []
+    return _SUBSCRIBED[node.executable]
+
+
+def _live(values: Mapping[str, str]) -> list[NodeSpec]:
+    source = None
+    if values["source"] != "none":
+        parameters = {"source": values["source"], "pacing": "rate", "rate": float(values["rate"])}
+        source = NodeSpec("frame_source", parameters)
+    return chain(
+        source,
+        calibration=values["calibration"],
+        output=values["output"],
+        queue_policy="drop_oldest",
+        image_topic=values["image_topic"],
+    )
+
+
+def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
+    source = replayed(values["bag"], values["topic"])
+    return chain(source, calibration=values["calibration"], output=values["output"])
+
+
+def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
+    size = int(values["size"])
+    source = simulated(
+        int(values["cycles"]),
+        width_px=size,
+        height_px=size,
+        seed=int(values["seed"]),
+        optics_seed=int(values["optics_seed"]),
+    )
+    return chain(source, calibration=values["calibration"], output=values["output"])
+
+
+_CALIBRATION = {"calibration": ("", "Calibration file; empty: x and y only")}
+_OUTPUT = {"output": ("", "Directory of the bag to record; empty: none")}
+_CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
+_NAMESPACE = {"namespace": ("", "Namespace of the nodes and their topics")}
+
+SYSTEMS = {
+    "live": System(
+        "A source at its own pace; what cannot be kept up with is dropped, oldest first, and counted.",
+        {
+            **_CALIBRATION,
+            "source": ("simulator", "Source of the frames; none: a camera driver publishes image_topic"),
+            "rate": ("10.0", "Frames per second; 0.0: as the source delivers them"),
+            "image_topic": (topics.IMAGE, "Topic of the images"),
+            **_OUTPUT,
+            **_CONFIG,
+            **_NAMESPACE,
+        },
+        _live,
+    ),
+    "replay": System(
+        "A bag as fast as the nodes take it, nothing lost.",
+        {
+            "bag": ("", "Directory of a rosbag2 bag, or an .mcap file"),
+            "topic": ("", "Topic of its images; empty: the only one, or the only one named image_raw"),
+            **_CALIBRATION,
+            **_OUTPUT,
+            **_CONFIG,
+            **_NAMESPACE,
+        },
+        _replay,
+    ),
+    "demo": System(
+        "A simulated gear as fast as the nodes take it, nothing lost.",
+        {
+            **_CALIBRATION,
+            "cycles": ("80", "Motion cycles; 80 are a revolution"),
+            "size": ("2048", "Width and height of the frames, px"),
+            "seed": ("1", "Seed of particles, motion and noise"),
+            "optics_seed": ("1", "Seed of the optics; must be that of the calibration"),
+            **_OUTPUT,
+            **_CONFIG,
+            **_NAMESPACE,
+        },
+        _demo,
+    ),
+}
+
+
+# Runner ------------------------------------------------------------------------------------------
+
+
+class RunningSystem:
+    """The processes of a system, by executable."""
+
+    #: Seconds that a process is given after SIGINT and after SIGTERM.
+    GRACE = (12.0, 3.0)
+
+    def __init__(self, processes: Mapping[str, subprocess.Popen[str]]) -> None:
+        self.processes = processes
+
+    def poll(self) -> dict[str, int]:
+        """Exit codes of the processes that have ended."""
+        codes = {name: process.poll() for name, process in self.processes.items()}
+        return {name: code for name, code in codes.items() if code is not None}
+
+    def wait(self, *names: str, timeout: float | None = None) -> dict[str, int]:
+        """Wait until one of ``names``, default all, has ended or any process has failed; returns ``poll()``.
+
+        Raises TimeoutError after ``timeout`` s.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            ended = self.poll()
+            if any(ended.values()) or any(name in ended for name in names or self.processes):
+                return ended
+            if deadline is not None and time.monotonic() > deadline:
+                raise TimeoutError(f"still running after {timeout:g} s: {', '.join(self.processes)}")
+            time.sleep(0.02)
+
+    def stop(self) -> dict[str, int]:
+        """Stop what still runs, in the order of the flow, so that each finishes what it was sent.
+
+        SIGINT, then SIGTERM, then SIGKILL; returns all exit codes, negative ones by a signal.
+        """
+        for process in self.processes.values():
+            for number, grace in zip((signal.SIGINT, signal.SIGTERM), self.GRACE, strict=True):
+                if process.poll() is None:
+                    process.send_signal(number)
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(grace)
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        return self.poll()
+
+
+@contextlib.contextmanager
+def run_system(
+    nodes: Sequence[NodeSpec],
+    *,
+    namespace: str = "",
+    config: str = "",
+    environment: Mapping[str, str] = transport.LOCALHOST_ONLY,
+    on_line: Callable[[str], None] = print,
+) -> Iterator[RunningSystem]:
+    """Start the nodes as processes, and stop them all at the end of the context, however it ends.
+
+    ``config``: directory of parameter files; ``environment``: what is added to ours, by default
+    discovery limited to this machine; ``on_line`` gets every line they print, with the node's name.
+    """
+    processes: dict[str, subprocess.Popen[str]] = {}
+    readers = []
+    try:
+        for node in nodes:
+            process = subprocess.Popen(
+                command(node, namespace, config),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                env={**_ENVIRONMENT, **os.environ, **environment, PARENT_VARIABLE: str(os.getpid())},
+                start_new_session=True,  # Ctrl-C reaches us alone, and we stop them in order
+            )
+            processes[node.executable] = process
+            reader = threading.Thread(target=_forward, args=(node.executable, process, on_line), daemon=True)
+            reader.start()
+            readers.append(reader)
+        yield RunningSystem(processes)
+    finally:
+        RunningSystem(processes).stop()
+        for reader in readers:
+            reader.join(timeout=1.0)
+
+
+_ENVIRONMENT = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": "{severity} {message}"}
+
+
+def command(node: NodeSpec, namespace: str = "", config: str = "") -> list[str]:
+    """The command line of a node."""
+    arguments = [sys.executable, "-m", f"mems6dof_ros.nodes.{node.executable}", "--ros-args"]
+    if namespace:
+        arguments += ["-r", f"__ns:=/{namespace.strip('/')}"]
+    for before, after in node.remappings.items():
+        arguments += ["-r", f"{before}:={after}"]
+    if config:
+        arguments += ["--params-file", str(Path(config) / f"{node.executable}.yaml")]
+    for name, value in given(node).items():
+        arguments += ["-p", f"{name}:={to_yaml(value)}"]
+    return arguments
+
+
+def given(node: NodeSpec) -> dict[str, Any]:
+    """The parameters of a node that can be handed over: ROS 2 has no way to write an empty list or text."""
+    return {name: value for name, value in node.parameters.items() if value not in ("", [], ())}
+
+
+def _forward(name: str, process: subprocess.Popen[str], on_line: Callable[[str], None]) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        on_line(f"[{name}] {line.rstrip()}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a system until its source ends or a signal comes; returns 0, or 1 where a node failed."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
+    try:
+        system, values = _parse(arguments)
+        nodes = system.table(values)
+        last = [node.executable for node in nodes if node.ends_system]
+        with run_system(
+            nodes, namespace=values.get("namespace", ""), config=values.get("config", "")
+        ) as running:
+            running.wait(*last)
+            codes = running.stop()
+    except Mems6dofError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 0
+    return int(any(codes.values()))
+
+
+def _interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _parse(arguments: Sequence[str]) -> tuple[System, dict[str, str]]:
+    if not arguments or arguments[0] not in SYSTEMS:
+        raise InputError("arguments", " ".join(arguments) or "nothing", f"one of {', '.join(SYSTEMS)}")
+    values = {}
+    for argument in arguments[1:]:
+        name, separator, value = argument.partition(":=")
+        if not separator:
+            raise InputError("arguments", f"'{argument}'", "name:=value")
+        values[name] = value
+    return SYSTEMS[arguments[0]], values
+
+
+if __name__ == "__main__":
+    sys.exit(main())

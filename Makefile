@@ -2,13 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help setup demo test lint bench requirements clean
+.PHONY: help setup demo test lint bench config requirements clean
 
 help:
 	@echo 'make demo    simulate, calibrate, measure a turning gear through ROS 2, compare with truth'
 	@echo 'make test    every test'
 	@echo 'make lint    style and types'
 	@echo 'make bench   speed, every figure beside its limit'
+	@echo 'make config  write config/*.yaml anew from the parameter tables'
 	@echo 'make setup   only set up .venv'
 	@echo 'make clean   remove .venv and everything that was built'
 
@@ -26,6 +27,9 @@ lint: setup
 
 bench: setup
 	@$(BIN)/mems6dof bench $(ARGS)
+
+config: setup
+	@$(BIN)/python -m mems6dof_ros.nodes.parameters config
 
 requirements:
 	@cd requirements && uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header runtime.in -o runtime.txt

@@ -1,0 +1,43 @@
+"""Systems of nodes for `launch`: the thin other half of ``system``. Needs a ROS installation."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from mems6dof_ros.nodes.system import NodeSpec, System, given
+
+
+def description(system: System) -> Any:
+    """LaunchDescription of ``system``: its arguments, then its nodes, once the arguments have values."""
+    from launch import LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=doc)
+        for name, (default, doc) in system.arguments.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=lambda context: _nodes(system, context))])
+
+
+def _nodes(system: System, context: Any) -> list[Any]:
+    values = {name: context.launch_configurations[name] for name in system.arguments}
+    return [_node(spec, values["namespace"], values["config"]) for spec in system.table(values)]
+
+
+def _node(spec: NodeSpec, namespace: str, config: str) -> Any:
+    from launch.actions import Shutdown
+    from launch_ros.actions import Node
+
+    files = [os.fspath(Path(config) / f"{spec.executable}.yaml")] if config else []
+    return Node(
+        package="mems6dof_ros",
+        executable=spec.executable,
+        name=spec.executable,
+        namespace=namespace,
+        parameters=[*files, given(spec)],
+        remappings=list(spec.remappings.items()),
+        output="screen",
+        on_exit=Shutdown() if spec.ends_system else None,
+    )

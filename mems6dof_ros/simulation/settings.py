@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.simulation.aberrations import PRESETS
@@ -109,15 +109,11 @@ class SimulationSettings:
             _check(spec, getattr(self, spec.name))
         limit = PIXEL_FORMATS[self.pixel_format]
         if self.saturation_adu > limit:
-            raise InputError(
-                "saturation_adu", str(self.saturation_adu), f"at most {limit} for {self.pixel_format}"
-            )
+            _refuse("saturation_adu", self.saturation_adu, f"at most {limit} for {self.pixel_format}")
         if self.hub_diameter >= self.gear_diameter:
-            raise InputError(
-                "hub_diameter", f"{self.hub_diameter} m", f"less than gear_diameter, {self.gear_diameter} m"
-            )
+            _refuse("hub_diameter", self.hub_diameter, f"less than gear_diameter, {self.gear_diameter} m")
         if self.clumps and self.clumps >= self.particles:
-            raise InputError("clumps", str(self.clumps), f"fewer than the {self.particles} particles")
+            _refuse("clumps", self.clumps, f"fewer than the {self.particles} particles")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> SimulationSettings:
@@ -142,15 +138,17 @@ class SimulationSettings:
 
 def _check(spec: dataclasses.Field[Any], value: Any) -> None:
     """Raise InputError unless ``value`` suits the field ``spec``."""
-    where = f"simulation setting {spec.name}"
     if "choices" in spec.metadata:
         if value not in spec.metadata["choices"]:
-            raise InputError(where, repr(value), f"one of {', '.join(spec.metadata['choices'])}")
+            _refuse(spec.name, value, f"one of {', '.join(spec.metadata['choices'])}")
         return
     low, high = spec.metadata["range"]
     whole = spec.type == "int"
     kind = int if whole else (int, float)
     if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
-        unit = spec.metadata["unit"]
-        expected = f"{'a whole number' if whole else 'a number'} from {low:g} to {high:g} {unit}"
-        raise InputError(where, repr(value), expected)
+        noun = "a whole number" if whole else "a number"
+        _refuse(spec.name, value, f"{noun} from {low:g} to {high:g} {spec.metadata['unit']}")
+
+
+def _refuse(name: str, value: Any, expected: str) -> NoReturn:
+    raise InputError(f"simulation setting {name}", repr(value), expected)

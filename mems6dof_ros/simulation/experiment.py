@@ -178,7 +178,7 @@ def focus_stack(
 
     Raises InputError unless the step leads from start to stop.
     """
-    if not (math.isfinite(step) and step and (stop - start) / step >= 0):
+    if not step or not 0 <= (stop - start) / step < math.inf:
         raise InputError("focus stack", f"{start} to {stop} m in steps of {step} m", "a step towards stop")
     substrate = BeadSubstrate(
         settings,

@@ -163,9 +163,7 @@ def scatter_particles(
     while len(xy) < count:
         attempts += 1
         if attempts > 200 * count:
-            raise InputError(
-                "simulation setting particles", str(count), f"at most about {len(xy)}: no room for more"
-            )
+            raise InputError("number of particles", str(count), f"about {len(xy)}: no room for more")
         if len(xy) < count - clumps:
             radius = math.sqrt(rng.uniform(inner_radius**2, outer_radius**2))
             candidate = radius * _direction(rng)

@@ -198,10 +198,12 @@ def test_noise_of_stacks_and_experiment_is_independent():
     assert np.abs(correlation - np.eye(4)).max() < 0.03
 
 
-@pytest.mark.parametrize("step", [0.0, -1e-7, math.nan])
-def test_a_step_that_never_arrives_is_refused(step):
+@pytest.mark.parametrize(
+    ("start", "step"), [(-1e-6, 0.0), (-1e-6, -1e-7), (-1e-6, math.nan), (-math.inf, 1e-7), (math.nan, 1e-7)]
+)
+def test_a_step_that_never_arrives_is_refused(start, step):
     with pytest.raises(InputError, match="a step towards stop"):
-        next(focus_stack(small(), -1e-6, 1e-6, step))
+        next(focus_stack(small(), start, 1e-6, step))
 
 
 def test_loop_continues_stamps_cycles_and_psi():

@@ -8,7 +8,7 @@ from typing import TextIO
 
 
 class Progress:
-    """Called as ``progress(done, total)``; ``total`` 0: unknown. Use as a context manager."""
+    """Called as ``progress(done, total, note)``; ``total`` 0: unknown. Use as a context manager."""
 
     def __init__(self, label: str, stream: TextIO | None = None) -> None:
         self._label, self._stream = label, stream or sys.stderr
@@ -24,7 +24,7 @@ class Progress:
         if self._last and self._terminal:
             self._stream.write("\n")
 
-    def __call__(self, done: int, total: int = 0) -> None:
+    def __call__(self, done: int, total: int = 0, note: str = "") -> None:
         now = time.monotonic()
         if done != total and now - self._shown < self._interval:
             return
@@ -36,6 +36,8 @@ class Progress:
         text += f", {rate:.1f}/s"
         if total and 0 < done < total:
             text += f", {(total - done) / rate:.0f} s left"
+        if note:
+            text += f": {note}"
         self._stream.write(f"\r{text.ljust(len(self._last))}" if self._terminal else f"{text}\n")
         self._stream.flush()
         self._last = text

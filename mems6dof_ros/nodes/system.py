@@ -81,6 +81,7 @@ def chain(
     queue_policy: str = "block",
     image_topic: str = topics.IMAGE,
     recorded: Sequence[str] = DEFAULT_TOPICS,
+    compression: str = "none",
 ) -> list[NodeSpec]:
     """frame_source, localizer, pose_estimator and, with an ``output``, recorder.
 
@@ -94,7 +95,12 @@ def chain(
     nodes.append(NodeSpec("pose_estimator", queue))
     if output:
         attachments = {"attachments": [calibration]} if calibration else {}
-        recorder = {"output": output, "topics": list(recorded), **attachments}
+        recorder = {
+            "output": output,
+            "topics": list(recorded),
+            "compression": compression,
+            **attachments,
+        }
         nodes.append(NodeSpec("recorder", recorder, remap))
     return [_waiting_for_subscribers(node, nodes) for node in nodes]
 

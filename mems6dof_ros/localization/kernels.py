@@ -49,7 +49,7 @@ MOST_ITERATIONS, ROUGH_ITERATIONS = 60, 4
 # Expected decrease of chi-square at which to stop, in units of chi-square per pixel: the last step is
 # then about sqrt(TOLERANCE) standard deviations, and it is still taken.
 TOLERANCE, ROUGH = 1e-4, 1e-2
-MOST_WINDOWS, MOST_OFF_CENTRE = 6, 0.75  # times a window is placed; px
+MOST_WINDOWS, MOST_OFF_CENTRE = 6, 1.0  # times a window is placed; px from particle to its middle
 
 Array: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.generic]
@@ -133,9 +133,9 @@ def _weigh(
             if valid[k] > 0:
                 mean = max(amplitude * shape[k] + background + noise[k], VARIANCE_FLOOR)
                 count = max(data[k] + noise[k], VARIANCE_FLOOR)
-                weights[k] = 1 / mean
-                pulls[k] = count / mean - 1
-                total += 2 * (mean - count - count * math.log(mean / count))
+                weights[k] = valid[k] / mean
+                pulls[k] = valid[k] * (count / mean - 1)
+                total += 2 * valid[k] * (mean - count - count * math.log(mean / count))
             else:
                 weights[k] = 0.0
                 pulls[k] = 0.0
@@ -146,12 +146,11 @@ def _weigh(
             greater = data[k] if r > 0 else model
             variance = greater + noise[k]
             variance = variance if variance > VARIANCE_FLOOR else VARIANCE_FLOOR
-            inverse = valid[k] / variance
-            chi = r * inverse
+            chi = r / variance
             renewed = 1.0 if r > 0 else 1 + 0.5 * chi
-            weights[k] = inverse * renewed * renewed
-            pulls[k] = chi * renewed
-            total += r * chi
+            weights[k] = valid[k] * renewed * renewed / variance
+            pulls[k] = valid[k] * chi * renewed
+            total += valid[k] * r * chi
     return total
 
 
@@ -340,6 +339,23 @@ def _read_window(
     return max(cut, 0), largest
 
 
+@njit(fastmath=_FAST, **_OPTIONS)
+def _soften(x: float, y: float, window: int, stride: int, valid: Array) -> None:
+    """Cut ``valid`` to the square of side ``window - 1`` about (x, y), edge pixels by the part inside.
+
+    A window of whole pixels jumps by one as a particle moves; what its edge cuts from the tails of a
+    defocused image then shifts the fit by half a standard deviation and more.
+    """
+    half = window // 2
+    inside = np.empty(stride)
+    for j in range(stride):
+        inside[j] = min(max(half + 0.5 - abs(j - half - x), 0.0), 1.0)
+    for i in range(window):
+        part = min(max(half + 0.5 - abs(i - half - y), 0.0), 1.0)
+        for k in range(stride):
+            valid[i * stride + k] *= part * inside[k]
+
+
 @njit(fastmath=_FAST_FINITE, **_OPTIONS)
 def _start(data: Array, valid: Array, u: Array, v: Array, window: int, stride: int, theta: Array) -> bool:
     """First parameters from the window alone: border, peak, and moments above 30 % of it.
@@ -411,7 +427,7 @@ def _inside(theta: Array, window: int) -> bool:
         and low < theta[3] < high
         and low < theta[4] < high
         and abs(theta[5]) < LARGEST_ATANH
-        and max(abs(theta[0]), abs(theta[1])) < 1
+        and max(abs(theta[0]), abs(theta[1])) < 2
         and abs(theta[6]) < np.inf
     )
 
@@ -591,8 +607,8 @@ def fit_windows(
 ) -> None:
     """Fit one Gaussian to the window about each start; NaN parameters where a fit fails.
 
-    The window follows the particle: it is moved until its central pixel is the fitted one, so that
-    the result does not depend on where the detection put it.
+    The window follows the particle, to a fraction of a pixel: neither where the detection put it nor
+    where the particle lies between pixels moves the result.
     """
     height, width = image.shape
     half = window // 2
@@ -614,8 +630,7 @@ def fit_windows(
         cut, largest = _read_window(
             image, column, row, offset, gain, read_variance, window, stride, data, read, valid
         )
-        known = starts.shape[1] == 7 and not math.isnan(starts[n, 2])
-        if known:
+        if starts.shape[1] == 7 and not math.isnan(starts[n, 2]):
             theta[:] = starts[n]
             theta[0] -= column
             theta[1] -= row
@@ -623,19 +638,19 @@ def fit_windows(
             theta[5] = math.atanh(theta[5])
         elif not _start(data, valid, u, v, window, stride, theta):
             continue
-        # First a rough uniform fit: a robust start for every weighting, and the amplitude that scales
-        # the relative one. Then the fit itself, repeated where it has left the centre of its window.
-        rough = weighting == RELATIVE or not (known or weighting == UNIFORM)
-        iterations, done = 0, -1
+        # First a rough uniform fit: a robust start for every weighting, the place of the window, and the
+        # light that scales the relative weights. Then the fit itself.
+        rough, iterations, done = True, 0, -1
         for _ in range(MOST_WINDOWS):
-            if max(abs(theta[0]), abs(theta[1])) > MOST_OFF_CENTRE:
-                move_x, move_y = round(theta[0]), round(theta[1])
+            move_x, move_y = round(theta[0]), round(theta[1])
+            if move_x != 0 or move_y != 0:
                 column, row = column + move_x, row + move_y
                 if not (0 <= column < width and 0 <= row < height):
                     done = -1
                     break
                 theta[0] -= move_x
                 theta[1] -= move_y
+            if move_x != 0 or move_y != 0 or done > 0:
                 cut, largest = _read_window(
                     image, column, row, offset, gain, read_variance, window, stride, data, read, valid
                 )
@@ -657,8 +672,10 @@ def fit_windows(
                         work,
                     )
                 )
-                _shape(theta, window, stride, shape)
                 continue
+            x, y = theta[0], theta[1]
+            _soften(x, y, window, stride, valid)
+            _shape(theta, window, stride, shape)
             for k in range(size):
                 if weighting == UNIFORM:
                     noise[k] = valid[k]
@@ -670,7 +687,7 @@ def fit_windows(
                 theta, data, noise, valid, u, v, window, stride, weighting, MOST_ITERATIONS, TOLERANCE, work
             )
             iterations += abs(done)
-            if done < 0 or max(abs(theta[0]), abs(theta[1])) <= MOST_OFF_CENTRE:
+            if done < 0 or max(abs(theta[0] - x), abs(theta[1] - y)) <= MOST_OFF_CENTRE:
                 break
         quality[n, 1] = iterations
         if done < 0 or not _inside(theta, window):

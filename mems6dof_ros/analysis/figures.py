@@ -230,10 +230,11 @@ def constellation(recording: Recording, body: str) -> Figure:
     left.plot(0, 0, "+", color=BLACK, ms=10)
     left.set_title(f"{len(x)} particles in the body frame")
     place, vector = mean_residuals(recording, body)
-    lateral = np.hypot(*vector[:, :2].T) * 1e9
-    arrows = right.quiver(*place.T * 1e6, *(vector[:, :2].T * 1e9), lateral, cmap="viridis", pivot="mid")
-    figure.colorbar(arrows, ax=right, label="mean residual in x, y (nm)", shrink=0.7)
-    right.set_title("Residuals that stay in the field")
+    if len(place):
+        lateral = np.hypot(*vector[:, :2].T) * 1e9
+        arrows = right.quiver(*place.T * 1e6, *(vector[:, :2].T * 1e9), lateral, cmap="viridis", pivot="mid")
+        figure.colorbar(arrows, ax=right, label="mean residual in x, y (nm)", shrink=0.7)
+    right.set_title("Residuals that stay in the field" if len(place) else "Too few residuals for a map")
     for axis in (left, right):
         axis.set_aspect("equal")
         axis.invert_yaxis()  # y runs down, as in the image

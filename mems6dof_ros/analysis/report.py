@@ -82,25 +82,8 @@ def describe(recording: Recording, body: str) -> BodyReport:
     comparison = compare_with_truth(recording, body)
     drawn: dict[str, tuple[str, Figure | None]] = {}
     with figures.style():
-        drawn["degrees_of_freedom"] = (
-            "Displacement from the reference in six degrees of freedom. Bands: two standard deviations, "
-            "often thinner than the line. Cycles before the last reference are expressed in it.",
-            figures.degrees_of_freedom(poses, comparison),
-        )
-        drawn["paths"] = ("Paths of the centre and of the tilt, by rotation.", figures.paths(poses))
-        drawn["rotation"] = ("Rotation per motion cycle and in sum.", figures.rotation(poses))
-        drawn["angles"] = ("The paper's nutation and precession.", figures.paper_angles(poses))
-        if comparison is not None:
-            drawn["truth"] = (
-                "Errors against truth; 95 of 100 should lie inside the claimed band.",
-                figures.truth_errors(measured, comparison),
-            )
-        drawn["residuals"] = ("Residuals of the rigid transform.", figures.residuals(measured))
-        drawn["constellation"] = (
-            "Left: the particles, size by how often seen. Right: means of residuals over squares of the "
-            "field; a pattern would be an error that the calibration left.",
-            figures.constellation(recording, body),
-        )
+        if any(pose.valid for pose in measured):
+            drawn |= _of_motion(recording, body, poses, comparison)
         drawn["particles"] = ("Particles by cycle.", figures.particles(measured))
         drawn["latency"] = ("Latency by stage, host clocks.", figures.latency(measured))
         pictures = [
@@ -115,6 +98,35 @@ def describe(recording: Recording, body: str) -> BodyReport:
         pictures,
         comparison is not None,
     )
+
+
+def _of_motion(
+    recording: Recording, body: str, poses: Sequence[CyclePose], comparison: TruthComparison | None
+) -> dict[str, tuple[str, Figure]]:
+    """Caption and figure by name; ``poses`` in one reference."""
+    measured = recording.poses[body]
+    drawn = {
+        "degrees_of_freedom": (
+            "Displacement from the reference in six degrees of freedom. Bands: two standard deviations, often "
+            "thinner than the line. Cycles before the last reference are expressed in it.",
+            figures.degrees_of_freedom(poses, comparison),
+        ),
+        "paths": ("Paths of the centre and of the tilt, by rotation.", figures.paths(poses)),
+        "rotation": ("Rotation per motion cycle and in sum.", figures.rotation(poses)),
+        "angles": ("The paper's nutation and precession.", figures.paper_angles(poses)),
+    }
+    if comparison is not None:
+        drawn["truth"] = (
+            "Errors against truth; 95 of 100 should lie inside the claimed band.",
+            figures.truth_errors(measured, comparison),
+        )
+    drawn["residuals"] = ("Residuals of the rigid transform.", figures.residuals(measured))
+    drawn["constellation"] = (
+        "Left: the particles, size by how often seen. Right: means of residuals over squares of the field; a "
+        "pattern would be an error that the calibration left.",
+        figures.constellation(recording, body),
+    )
+    return drawn
 
 
 def compare_with_truth(recording: Recording, body: str) -> TruthComparison | None:

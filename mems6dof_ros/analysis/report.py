@@ -107,8 +107,8 @@ def _of_motion(
     measured = recording.poses[body]
     drawn = {
         "degrees_of_freedom": (
-            "Displacement from the reference in six degrees of freedom. Bands: two standard deviations, often "
-            "thinner than the line. Cycles before the last reference are expressed in it.",
+            "Displacement from the reference in six degrees of freedom. Bands: two standard deviations, "
+            "often thinner than the line. Cycles before the last reference are expressed in it.",
             figures.degrees_of_freedom(poses, comparison),
         ),
         "paths": ("Paths of the centre and of the tilt, by rotation.", figures.paths(poses)),

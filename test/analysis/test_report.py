@@ -100,8 +100,9 @@ def test_earlier_references_are_expressed_in_the_last_one(bag):
     poses = recording.in_last_reference("load_gear")
     assert {pose.reference_version for pose in poses} == {max(versions)}
     comparison = compare(poses, recording.truth_of(poses))
-    # One gauge for all cycles: no worse than with one for each version, plus the tie's own error.
-    assert (comparison.rms < 1.3 * compare_with_truth(recording, "load_gear").rms).all()
+    # One gauge for all cycles instead of one for each version, which absorbs some error, and the error of the
+    # tie, which rests on the 7 cycles of the first version and so is 0.4 of a pose's: 1.2 and up by chance.
+    assert (comparison.rms < 1.8 * compare_with_truth(recording, "load_gear").rms).all()
     for before, after in zip(measured, poses, strict=True):
         if before.reference_version == max(versions):
             assert after is before

@@ -9,6 +9,8 @@ the six directions that no observation can fix (the gauge) free of false informa
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
 from mems6dof_ros.pose.field import FieldModes
-from mems6dof_ros.pose.rigid import RigidPose
+from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, rotation_z
 from mems6dof_ros.pose.solve import pose_jacobian
 
 Array = NDArray[np.float64]
@@ -29,10 +31,14 @@ WEAK_PRIOR = 10e-6
 GAUGE_STIFFNESS = 1e4
 #: Evidence, in degrees of freedom, behind the assumption that a particle is as noisy as it claims.
 NOISE_PRIOR = 20.0
+#: Most evidence that is remembered: about 200 cycles.
+NOISE_MEMORY = 400.0
 #: Variance factor assumed of a particle with a neighbour, until its own residuals say better.
 OVERLAP_FACTOR = 9.0
 #: Outliers in a row that prove a particle is not where the map has it.
 OUTLIERS_IN_A_ROW = 4
+#: Poses of a revolution over which the constant effect of the field error is taken.
+AROUND = 16
 #: Largest interval between two refinements, cycles.
 REFINE_AT_MOST = 64
 
@@ -67,6 +73,8 @@ class Constellation:
         self._information = np.diag(1 / field_prior)  # lower triangle; field first, then particles
         self._vector = np.zeros(len(modes))
         self._refined_at = 0
+        self._latest = IDENTITY
+        self._frames = np.zeros((2, 6, len(modes)))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -115,13 +123,26 @@ class Constellation:
         ``offset`` (n, 3) m: measured minus the place of ``linearisation(rows)``, field error not removed;
         ``weight`` (n, 3, 3) m^-2: inverse covariance of the localizations alone; ``modes`` (n, 3, k).
         """
-        jacobian = pose_jacobian(self._origin[rows], pose.rotation)
-        normal = np.einsum("nia,nib->ab", jacobian, weight @ jacobian)
+        order = np.argsort(rows)
+        moved = self._origin[rows[order]] @ pose.rotation.T
         _accumulate(
-            self._information, self._vector, rows, pose.rotation, offset, weight, jacobian,
-            np.linalg.inv(normal), modes,
+            self._information, self._vector, rows[order], pose.rotation, offset[order], weight[order], moved,
+            modes[order],
         )  # fmt: skip
         self.cycles += 1
+        self._latest = pose
+
+    def field_response(self, rows: Indices, pose: RigidPose, modes: Array) -> Array:
+        """How the field error moves ``rows`` (n,) against their predicted places at ``pose``, (n, 3, k):
+        the directly seen ``modes``, less what the map has absorbed of them, less what is no error of
+        the motion but a constant of the frames (see ``_constant_response``)."""
+        absorbed = pose.rotation @ self.coupling[rows]
+        return np.asarray(modes + absorbed - self._constant(rows, pose))
+
+    def _constant(self, rows: Indices, pose: RigidPose) -> Array:
+        microscope, body = self._frames
+        turned = (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
+        return np.asarray(pose_jacobian(self.position[rows], pose.rotation) @ (microscope + turned))
 
     def linearisation(self, rows: Indices) -> Array:
         """Fixed positions (n, 3) m that ``observe`` refers to."""
@@ -147,12 +168,11 @@ class Constellation:
 
     def learn_noise(self, rows: Indices, squares: Array, freedom: Array) -> None:
         """Add squared residuals (n, 2), normalised by the claimed covariance, with their degrees of
-        freedom (n, 2); the memory is about 200 cycles."""
-        self._squares[rows] += squares
-        self._freedom[rows] += freedom
-        long = np.maximum(1.0, self._freedom[rows] / 400.0)
-        self._squares[rows] /= long
-        self._freedom[rows] /= long
+        freedom (n, 2)."""
+        freedom = self._freedom[rows] + freedom
+        memory = np.maximum(1.0, freedom / NOISE_MEMORY)
+        self._squares[rows] = (self._squares[rows] + squares) / memory
+        self._freedom[rows] = freedom / memory
 
     @property
     def due(self) -> bool:
@@ -188,6 +208,39 @@ class Constellation:
                 block = inverse[first + a, first + b] * scale[k + first + a] * scale[k + first + b]
                 self.covariance[:, a, b] = self.covariance[:, b, a] = block
         self._refined_at = self.cycles
+        self._frames = self._constant_response()
+
+    def _constant_response(self) -> Array:
+        """What the field error does to all poses of a revolution alike, (2, 6, k): a constant motion of
+        the microscope frame and one of the body frame, by least squares.
+
+        No rotating body can measure either, both are definitions, and neither may enter the covariance:
+        an unknown constant is not an error of motion.
+        """
+        around, responses = [], []
+        for angle in np.arange(AROUND) * (math.tau / AROUND):
+            pose = self._latest.then(RigidPose(rotation_z(angle), np.zeros(3)))
+            place = pose.apply(self.position)
+            seen = np.flatnonzero((np.abs(place[:, :2]) < self.modes.half_size).all(axis=1))
+            if len(seen) >= 8:
+                around.append(np.c_[np.eye(3), pose.rotation])
+                responses.append(self._response(pose, place, seen))
+        constants = np.zeros((2, 6, len(self.modes)))
+        for part in (slice(0, 3), slice(3, 6)) if around else ():
+            stacked = np.concatenate([response[part] for response in responses])
+            solution = np.linalg.lstsq(np.concatenate(around), stacked, rcond=1e-3)[0]
+            constants[0, part], constants[1, part] = solution[:3], solution[3:]
+        return constants
+
+    def _response(self, pose: RigidPose, place: Array, seen: Indices) -> Array:
+        """Change (6, k) of a pose with the coefficients of the field error, particles ``seen``."""
+        modes = self.modes.evaluate(place[seen]) + pose.rotation @ self.coupling[seen]
+        jacobian = pose_jacobian(self.position[seen], pose.rotation).reshape(-1, 6)
+        normal = jacobian.T @ jacobian
+        scale = 1 / np.sqrt(np.diag(normal))
+        right = jacobian.T @ modes.reshape(len(jacobian), -1)
+        solution = np.linalg.lstsq(normal * np.outer(scale, scale), scale[:, None] * right, rcond=1e-10)[0]
+        return np.asarray(scale[:, None] * solution)
 
     def _forget_retired(self) -> None:
         """Eliminate retired particles from the information matrix: what they told stays."""
@@ -268,59 +321,87 @@ class Candidates:
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(information, vector, rows, rotation, offset, weight, jacobian, inverse, modes):  # type: ignore[no-untyped-def]
+def _accumulate(information, vector, rows, rotation, offset, weight, moved, modes):  # type: ignore[no-untyped-def]
+    """Add one cycle to the normal equations, its pose eliminated; ``rows`` ascending, ``moved`` = R p.
+
+    With W the weights, F the modes and J = [1, -hat(R p)], all turned into the body frame: the sum of
+    [F R]^T W [F R] less its projection on the pose, [F R]^T W J (J^T W J)^-1 J^T W [F R]. Rows of the result
+    are formed along contiguous memory, which the compiler vectorises.
+    """
     n, k = len(rows), modes.shape[2]
-    evidence = np.empty((n, 3, 6))  # R^T W J
-    gain = np.empty((n, 3, 6))  # R^T W J (J^T W J)^-1
-    field = np.zeros((k, 6))  # F^T W J
-    pull = np.zeros(6)  # J^T W r
+    evidence = np.zeros((6, k + 3 * n))  # J^T W [F R]
+    normal, pull = np.zeros((6, 6)), np.zeros(6)
+    jacobian, wj = np.zeros((3, 6)), np.zeros((3, 6))
+    jacobian[0, 0] = jacobian[1, 1] = jacobian[2, 2] = 1.0
     for i in range(n):
-        wj = weight[i] @ jacobian[i]
-        evidence[i] = rotation.T @ wj
-        gain[i] = evidence[i] @ inverse
-        pull += wj.T @ offset[i]
-        if k:
-            field += modes[i].T @ wj
-    field_gain = field @ inverse
-    for a in range(k):
-        for c in range(6):
-            vector[a] -= field_gain[a, c] * pull[c]
-        for b in range(a + 1):
-            total = 0.0
-            for c in range(6):
-                total += field_gain[a, c] * field[b, c]
-            information[a, b] -= total
-    for i in range(n):
-        row = k + 3 * rows[i]
-        turned = rotation.T @ weight[i]
-        own = turned @ rotation
-        wr = turned @ offset[i]
+        v, r = moved[i], offset[i]
+        jacobian[0, 4], jacobian[0, 5] = v[2], -v[1]
+        jacobian[1, 3], jacobian[1, 5] = -v[2], v[0]
+        jacobian[2, 3], jacobian[2, 4] = v[1], -v[0]
         for a in range(3):
-            total = wr[a]
             for c in range(6):
-                total -= gain[i, a, c] * pull[c]
-            vector[row + a] += total
-            for b in range(3):
-                information[row + a, row + b] += own[a, b]
-        for j in range(n):
-            column = k + 3 * rows[j]
-            if column > row:
-                continue
-            for a in range(3):
-                for b in range(3):
-                    total = 0.0
-                    for c in range(6):
-                        total += gain[i, a, c] * evidence[j, b, c]
-                    information[row + a, column + b] -= total
-        if k:
-            wf = weight[i] @ modes[i]
-            seen = rotation.T @ wf
+                wj[a, c] = (
+                    weight[i, a, 0] * jacobian[0, c] + weight[i, a, 1] * jacobian[1, c]
+                    + weight[i, a, 2] * jacobian[2, c]
+                )  # fmt: skip
+        for c in range(6):
+            w0, w1, w2 = wj[0, c], wj[1, c], wj[2, c]
+            pull[c] += w0 * r[0] + w1 * r[1] + w2 * r[2]
+            for b in range(6):
+                normal[c, b] += w0 * jacobian[0, b] + w1 * jacobian[1, b] + w2 * jacobian[2, b]
             for m in range(k):
-                for a in range(3):
-                    total = seen[a, m]
-                    for c in range(6):
-                        total -= gain[i, a, c] * field[m, c]
-                    information[row + a, m] += total
-                for a in range(3):
-                    vector[m] += wf[a, m] * offset[i, a]
-            information[:k, :k] += modes[i].T @ wf
+                evidence[c, m] += w0 * modes[i, 0, m] + w1 * modes[i, 1, m] + w2 * modes[i, 2, m]
+            for a in range(3):
+                evidence[c, k + 3 * i + a] = w0 * rotation[0, a] + w1 * rotation[1, a] + w2 * rotation[2, a]
+    gain = np.linalg.solve(normal, evidence)
+    line = np.empty(k + 3 * n)
+    for row in range(k + 3 * n):
+        place = row if row < k else k + 3 * rows[(row - k) // 3] + (row - k) % 3
+        line[: row + 1] = 0.0
+        drop = 0.0
+        for c in range(6):
+            g = gain[c, row]
+            drop += g * pull[c]
+            for column in range(row + 1):
+                line[column] += g * evidence[c, column]
+        vector[place] -= drop
+        for column in range(min(row + 1, k)):
+            information[place, column] -= line[column]
+        for j in range((row + 1 - k + 2) // 3 if row >= k else 0):
+            at, base = k + 3 * rows[j], k + 3 * j
+            for a in range(3):
+                if base + a <= row:
+                    information[place, at + a] -= line[base + a]
+    wf = np.empty((3, k))
+    turned = np.empty((3, 3))
+    for i in range(n):
+        place = k + 3 * rows[i]
+        for a in range(3):
+            for b in range(3):
+                turned[a, b] = (
+                    rotation[0, a] * weight[i, 0, b] + rotation[1, a] * weight[i, 1, b]
+                    + rotation[2, a] * weight[i, 2, b]
+                )  # fmt: skip
+            vector[place + a] += (
+                turned[a, 0] * offset[i, 0] + turned[a, 1] * offset[i, 1] + turned[a, 2] * offset[i, 2]
+            )
+            for b in range(a + 1):
+                information[place + a, place + b] += (
+                    turned[a, 0] * rotation[0, b]
+                    + turned[a, 1] * rotation[1, b]
+                    + turned[a, 2] * rotation[2, b]
+                )
+            for m in range(k):
+                wf[a, m] = (
+                    weight[i, a, 0] * modes[i, 0, m] + weight[i, a, 1] * modes[i, 1, m]
+                    + weight[i, a, 2] * modes[i, 2, m]
+                )  # fmt: skip
+                information[place + a, m] += (
+                    turned[a, 0] * modes[i, 0, m] + turned[a, 1] * modes[i, 1, m]
+                    + turned[a, 2] * modes[i, 2, m]
+                )  # fmt: skip
+        for m in range(k):
+            f0, f1, f2 = modes[i, 0, m], modes[i, 1, m], modes[i, 2, m]
+            vector[m] += wf[0, m] * offset[i, 0] + wf[1, m] * offset[i, 1] + wf[2, m] * offset[i, 2]
+            for b in range(m + 1):
+                information[m, b] += f0 * wf[0, b] + f1 * wf[1, b] + f2 * wf[2, b]

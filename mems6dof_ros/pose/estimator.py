@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, fields
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from mems6dof_ros.pose.constellation import Candidates, Constellation
 from mems6dof_ros.pose.cycle_pose import CyclePose, PaperAngles, Status
 from mems6dof_ros.pose.field import FieldModes
 from mems6dof_ros.pose.registration import ConstellationIndex, closest_points, log10_false_alarms
-from mems6dof_ros.pose.rigid import RigidPose, rotation_z, shift_origin
+from mems6dof_ros.pose.rigid import RigidPose, lever_jacobian, rotation_z
 from mems6dof_ros.pose.solve import FULL, LATERAL, UNUSED, Solution, solve_pose
 
 Array = NDArray[np.float64]
@@ -246,7 +247,7 @@ class PoseEstimator:
         modes = constellation.modes.evaluate(view.position[took_part])
         factor = constellation.noise_factor(rows) * (self._noise[:, 0] / self._noise[:, 1])
         measured_covariance = _scaled(view.covariance[took_part], factor)
-        turned = (start.rotation @ constellation.coupling[rows] + modes) @ constellation.field_factor
+        response = constellation.field_response(rows, start, modes)
         solution = solve_pose(
             start,
             constellation.position[rows],
@@ -254,7 +255,7 @@ class PoseEstimator:
             view.position[took_part] - modes @ constellation.field_mean,
             measured_covariance,
             view.has_z[took_part],
-            turned,
+            response @ constellation.field_factor,
             s.gate_xy,
             s.gate_z,
         )
@@ -433,10 +434,9 @@ class PoseEstimator:
     ) -> None:
         """Compare residuals with what the covariances claim, over all particles and for each."""
         use = solution.use
-        squares = np.nan_to_num(np.c_[solution.distance_xy, solution.distance_z])
-        squares[use == UNUSED] = 0.0
-        squares[use != FULL, 1] = 0.0
-        freedom = np.c_[2.0 * (use > UNUSED), 1.0 * (use == FULL)]
+        counted = np.stack([use > UNUSED, use == FULL], axis=1)
+        squares = np.where(counted, np.stack([solution.distance_xy, solution.distance_z], axis=1), 0.0)
+        freedom = counted * np.array([2.0, 1.0])
         total = freedom.sum(axis=0)
         left = np.maximum(total - 3, 0) / np.maximum(total, 1)  # the pose takes three of each
         current = self._noise[:, 0] / self._noise[:, 1]
@@ -449,6 +449,8 @@ class PoseEstimator:
     def _recruit(self, view: _View, constellation: Constellation, state: _State, newcomers: Indices) -> None:
         """Follow unmatched localizations as candidates; confirm those that move with the body."""
         pose, candidates = state.pose, self.candidates
+        if not len(newcomers) and not len(candidates):
+            return
         back = pose.inverse()
         place = back.apply(view.position[newcomers])
         jacobian = np.zeros((len(newcomers), 3, 6))
@@ -562,17 +564,21 @@ class PoseEstimator:
     ) -> CyclePose:  # fmt: skip
         """The pose in the body frame of the current reference, with everything derived from it."""
         reference = self._reference
-        displacement, displacement_covariance, rotation, translation, covariance = self._displaced(
-            state, state.covariance
-        )
+        lever = state.pose.rotation @ reference.origin
+        rotation = state.pose.rotation @ reference.rotation.T
+        translation = state.pose.translation + lever
+        shift = lever_jacobian(lever)
+        displacement, jacobian = self._displaced(state)
         increment, increment_covariance, span = np.full(6, np.nan), np.full((6, 6), np.nan), 0
         if before is not None:
-            increment = displacement - self._displaced(before, before.covariance)[0]
             # The map and the field error are common to both cycles; their noise is not.
+            displacement_before, jacobian_before = self._displaced(before)
+            increment = displacement - displacement_before
             increment_covariance = (
-                self._displaced(state, state.noise)[1] + self._displaced(before, before.noise)[1]
+                jacobian @ state.noise @ jacobian.T + jacobian_before @ before.noise @ jacobian_before.T
             )
             span = state.cycle - before.cycle
+        displacement_covariance = jacobian @ state.covariance @ jacobian.T
         particle_id = np.full(len(localizations), -1, np.int32)
         residual = np.full((len(localizations), 3), np.nan)
         used = solution.use > UNUSED
@@ -592,7 +598,7 @@ class PoseEstimator:
             reference_version=reference.version,
             rotation=rotation,
             translation=translation,
-            covariance=covariance,
+            covariance=shift @ state.covariance @ shift.T,
             displacement=displacement,
             displacement_covariance=displacement_covariance,
             angles=paper_angles(displacement, displacement_covariance),
@@ -610,19 +616,18 @@ class PoseEstimator:
             latency=localizations.latency,
         )
 
-    def _displaced(self, state: _State, covariance: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Displacement (6,) with covariance, and pose with covariance, of ``state`` in the body frame."""
+    def _displaced(self, state: _State) -> tuple[Array, Array]:
+        """Displacement (6,) of ``state`` from the reference, and its derivative (6, 6) by the disturbance
+        of the pose in the map frame."""
         reference = self._reference
         lever = state.pose.rotation @ reference.origin
-        translation = state.pose.translation + lever
-        rotation = state.pose.rotation @ reference.rotation.T
-        covariance = shift_origin(covariance, lever)
-        tilt_x, tilt_y, twist = swing_twist(rotation)
-        psi = unwrap_near(twist, state.psi - reference.psi)
-        jacobian = np.eye(6)
+        tilt_x, tilt_y, twist = swing_twist(state.pose.rotation @ reference.rotation.T)
+        displacement = np.empty(6)
+        displacement[:3] = state.pose.translation + lever - reference.place
+        displacement[3:] = tilt_x, tilt_y, unwrap_near(twist, state.psi - reference.psi)
+        jacobian = lever_jacobian(lever)
         jacobian[3:, 3:] = swing_twist_jacobian(tilt_x, tilt_y)
-        displacement = np.r_[translation - reference.place, tilt_x, tilt_y, psi]
-        return displacement, jacobian @ covariance @ jacobian.T, rotation, translation, covariance
+        return displacement, jacobian
 
     def _no_pose(self, localizations: Localizations, status: Status, reason: str) -> CyclePose:
         nan6, nan66, n = np.full(6, np.nan), np.full((6, 6), np.nan), len(localizations)

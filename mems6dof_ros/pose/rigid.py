@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+_ONE = np.eye(3)
+
+
 class RigidPose(NamedTuple):
     """Body to microscope frame: ``rotation`` (3, 3), ``translation`` (3,) m."""
 
@@ -41,12 +44,9 @@ IDENTITY = RigidPose(np.eye(3), np.zeros(3))
 
 
 def hat(v: Array) -> Array:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``hat(v) @ u = v x u``."""
-    v = np.asarray(v, float)
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
+    """Cross-product matrix (3, 3) of ``v`` (3,): ``hat(v) @ u = v x u``."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation_z(angle: float) -> Array:
@@ -60,8 +60,8 @@ def exp_so3(w: Array) -> Array:
     angle = math.sqrt(float(w @ w))
     k = hat(w)
     if angle < 1e-4:  # series: the closed form cancels
-        return np.eye(3) + (1 - angle**2 / 6) * k + (0.5 - angle**2 / 24) * (k @ k)
-    return np.eye(3) + math.sin(angle) / angle * k + (1 - math.cos(angle)) / angle**2 * (k @ k)
+        return _ONE + (1 - angle**2 / 6) * k + (0.5 - angle**2 / 24) * (k @ k)
+    return _ONE + math.sin(angle) / angle * k + (1 - math.cos(angle)) / angle**2 * (k @ k)
 
 
 def log_so3(rotation: Array) -> Array:
@@ -92,7 +92,7 @@ def left_jacobian(w: Array) -> Array:
     angle = math.sqrt(float(w @ w))
     k = hat(w)
     if angle < 1e-4:
-        return np.eye(3) + 0.5 * k + (k @ k) / 6
+        return _ONE + 0.5 * k + (k @ k) / 6
     return np.eye(3) + (1 - math.cos(angle)) / angle**2 * k + (angle - math.sin(angle)) / angle**3 * (k @ k)
 
 
@@ -111,6 +111,13 @@ def kabsch(body: Array, measured: Array, weights: Array | None = None) -> RigidP
 def shift_origin(covariance: Array, lever: Array) -> Array:
     """Covariance (6, 6) of a pose whose origin moves by ``lever`` (3,) m, given in the microscope
     frame: ``t' = t + lever``, hence ``d' = d + w x lever``."""
-    jacobian = np.eye(6)
-    jacobian[:3, 3:] = -hat(lever)
+    jacobian = lever_jacobian(lever)
     return jacobian @ covariance @ jacobian.T
+
+
+def lever_jacobian(lever: Array) -> Array:
+    """d(d', w) / d(d, w), (6, 6), of that change of origin."""
+    jacobian = np.zeros((6, 6))
+    np.fill_diagonal(jacobian, 1.0)
+    jacobian[:3, 3:] = -hat(lever)
+    return jacobian

@@ -70,25 +70,13 @@ def solve_pose(
         return Solution(False, pose, nan, nan, use, residual, distance_xy, distance_z, math.nan, 0)
 
     # The exact solution with the field error common to all: one linear step from a converged start.
-    modes = field.shape[2]
-    jacobian = pose_jacobian(body, rotation)
-    design = np.concatenate([jacobian, field], axis=2)
-    weighted = weight @ design
-    flat, flat_weighted = design.reshape(-1, 6 + modes), weighted.reshape(-1, 6 + modes)
-    normal = flat.T @ flat_weighted
-    normal[6:, 6:] += np.eye(modes)
-    right = flat_weighted.T @ residual.ravel()
-    inverse = _invert_spd(normal)
-    step = inverse @ right
-    pose = RigidPose(_exp(step[3:6]) @ rotation, translation + step[:3])
-    residual = residual - (flat @ step).reshape(-1, 3)
+    step, covariance, noise, chi_square = _marginalise(
+        body @ rotation.T, field, weight, residual, measured_covariance
+    )
     residual[use == UNUSED] = np.nan
-    chi_square = float(np.einsum("ni,nij,nj->", np.nan_to_num(residual), weight, np.nan_to_num(residual)))
-    chi_square += float(step[6:] @ step[6:])
-    gain = (inverse[:6] @ flat_weighted.T).reshape(6, -1, 3)
-    noise = np.einsum("ani,nij,bnj->ab", gain, measured_covariance, gain, optimize=True)
+    pose = RigidPose(_exp(step[3:]) @ rotation, translation + step[:3])
     return Solution(
-        True, pose, inverse[:6, :6], noise, use, residual, distance_xy, distance_z,
+        True, pose, covariance, noise, use, residual, distance_xy, distance_z,
         chi_square, 2 * count_xy + count_z - 6,
     )  # fmt: skip
 
@@ -102,12 +90,6 @@ def pose_jacobian(body: Array, rotation: Array) -> Array:
     jacobian[:, 1, 3], jacobian[:, 1, 5] = -moved[:, 2], moved[:, 0]
     jacobian[:, 2, 3], jacobian[:, 2, 4] = moved[:, 1], -moved[:, 0]
     return jacobian
-
-
-def _invert_spd(matrix: Array) -> Array:
-    """Inverse of a positive definite matrix whose rows differ in unit (metre, radian)."""
-    scale = 1 / np.sqrt(np.diag(matrix))
-    return np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
 
 
 @njit(cache=True, nogil=True)
@@ -154,6 +136,101 @@ def _solve_spd(matrix, right):  # type: ignore[no-untyped-def]
             total -= lower[k, i] * x[k]
         x[i] = total / lower[i, i]
     return x * scale, True
+
+
+@njit(cache=True, nogil=True)
+def _marginalise(moved, field, weight, residual, measured_covariance):  # type: ignore[no-untyped-def]
+    """One linear step in the field error's coefficients (k, unit prior) and the pose (6), in this order.
+
+    Returns the step of the pose, its covariance, the part of it that the localizations' own noise makes
+    (gain times their covariance), and chi-square; ``residual`` is updated.
+    """
+    n, k = len(moved), field.shape[2]
+    size = k + 6
+    design = np.zeros((3 * n, size))
+    weighted = np.empty((3 * n, size))
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for m in range(k):
+        normal[m, m] = 1.0
+    for i in range(n):
+        v = moved[i]
+        for a in range(3):
+            row = design[3 * i + a]
+            row[:k] = field[i, a]
+            row[k + a] = 1.0
+        design[3 * i, k + 4], design[3 * i, k + 5] = v[2], -v[1]
+        design[3 * i + 1, k + 3], design[3 * i + 1, k + 5] = -v[2], v[0]
+        design[3 * i + 2, k + 3], design[3 * i + 2, k + 4] = v[1], -v[0]
+        for a in range(3):
+            w0, w1, w2 = weight[i, a]
+            for m in range(size):
+                weighted[3 * i + a, m] = (
+                    w0 * design[3 * i, m] + w1 * design[3 * i + 1, m] + w2 * design[3 * i + 2, m]
+                )
+        for a in range(3):
+            r = 3 * i + a
+            for m in range(size):
+                x = design[r, m]
+                right[m] += weighted[r, m] * residual[i, a]
+                for b in range(m + 1):
+                    normal[m, b] += x * weighted[r, b]
+    # Cholesky of the scaled matrix; the last six rows of its inverse are what the pose needs.
+    scale = np.empty(size)
+    for m in range(size):
+        scale[m] = 1 / math.sqrt(normal[m, m])
+    lower = np.zeros((size, size))
+    for m in range(size):
+        for b in range(m + 1):
+            total = normal[m, b] * scale[m] * scale[b]
+            for c in range(b):
+                total -= lower[m, c] * lower[b, c]
+            lower[m, b] = math.sqrt(total) if m == b else total / lower[b, b]
+    rows = np.zeros((7, size))  # solutions for the six unit vectors of the pose, and for the right side
+    for q in range(7):
+        x = rows[q]
+        if q < 6:
+            x[k + q] = 1.0
+        else:
+            x[:] = right * scale
+        for m in range(k if q < 6 else 0, size):
+            total = x[m]
+            for c in range(m):
+                total -= lower[m, c] * x[c]
+            x[m] = total / lower[m, m]
+        for m in range(size - 1, -1, -1):
+            x[m] /= lower[m, m]
+            for c in range(m):
+                x[c] -= lower[m, c] * x[m]
+        for m in range(size):
+            x[m] *= scale[m] * (scale[k + q] if q < 6 else 1.0)
+    covariance = rows[:6, k:].copy()
+    step = rows[6]
+    noise = np.zeros((6, 6))
+    gain = np.empty((6, 3))
+    chi_square = 0.0
+    for m in range(k):
+        chi_square += step[m] * step[m]
+    for i in range(n):
+        for q in range(6):
+            for a in range(3):
+                total = 0.0
+                for m in range(size):
+                    total += rows[q, m] * weighted[3 * i + a, m]
+                gain[q, a] = total
+        for q in range(6):
+            for a in range(3):
+                half = 0.0
+                for b in range(3):
+                    half += gain[q, b] * measured_covariance[i, b, a]
+                for p in range(6):
+                    noise[q, p] += half * gain[p, a]
+        for a in range(3):
+            for m in range(size):
+                residual[i, a] -= design[3 * i + a, m] * step[m]
+        for a in range(3):
+            for b in range(3):
+                chi_square += residual[i, a] * weight[i, a, b] * residual[i, b]
+    return step[k:].copy(), covariance, noise, chi_square
 
 
 @njit(cache=True, nogil=True)

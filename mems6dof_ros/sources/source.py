@@ -60,6 +60,10 @@ SOURCES = {
     "simulator": ("mems6dof_ros.sources.simulator", "SimulatorSource"),
     "images": ("mems6dof_ros.sources.images", "ImagesSource"),
     "bag": ("mems6dof_ros.sources.bag", "BagSource"),
+    "video": ("mems6dof_ros.sources.video", "VideoSource"),
+    "genicam": ("mems6dof_ros.sources.cameras.genicam", "GenicamSource"),
+    "basler": ("mems6dof_ros.sources.cameras.basler", "BaslerSource"),
+    "opencv": ("mems6dof_ros.sources.cameras.opencv", "OpencvSource"),
 }
 
 

@@ -1,0 +1,1 @@
+"""Live cameras: drivers, pixel formats, clocks, and the source that joins them."""

@@ -1,0 +1,233 @@
+"""What a user sets on a camera, and setting it through GenICam's standard feature names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import NAN
+from mems6dof_ros.sources.cameras.device import DeviceState
+from mems6dof_ros.sources.cameras.pixels import FORMATS, check_format, full_scale
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Settings of a live camera; an empty or NaN one stays as the camera has it.
+
+    ``device``: which camera, as `mems6dof cameras` lists it; empty: the only one.
+    ``pixel_format``: PFNC name; empty: the deepest monochrome one.
+    ``exposure`` s. ``gain`` in the camera's unit (dB by GenICam's standard). ``frame_rate`` Hz.
+    ``region``: x, y, width, height, px; empty: the whole sensor.
+    ``trigger``: off (free running), software (one frame per 1/``frame_rate``, or per call of
+    ``trigger()`` where no rate is given), or the camera's name of an input, for instance Line1.
+    ``timestamp_at``: whether the device stamps the start or the end of the exposure.
+    ``latency`` s, from the end of the exposure to the first bytes in the host, where it was measured.
+    ``buffers``: frames that may wait in the driver. ``packet_size`` bytes, GigE Vision; 0: the largest that
+    gets through. ``pixel_size`` m in object space. ``saturation_adu`` 0: the end of the pixel format's scale
+    (a 12-bit sensor in Mono16 may saturate at 65520). ``features``: further GenICam features, "Name=value",
+    set before the others.
+    """
+
+    device: str = ""
+    pixel_format: str = ""
+    exposure: float = NAN
+    gain: float = NAN
+    frame_rate: float = NAN
+    region: tuple[int, ...] = ()
+    trigger: str = "off"
+    timestamp_at: str = "start"
+    latency: float = NAN
+    buffers: int = 16
+    packet_size: int = 0
+    pixel_size: float = NAN
+    saturation_adu: int = 0
+    features: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value, kind = getattr(self, field.name), type(field.default)
+            if kind is float and isinstance(value, int) and not isinstance(value, bool):
+                object.__setattr__(self, field.name, float(value))
+            elif kind is tuple and isinstance(value, Sequence) and not isinstance(value, str):
+                object.__setattr__(self, field.name, tuple(value))
+            elif not isinstance(value, kind) or isinstance(value, bool):
+                raise InputError(field.name, repr(value), f"a value of type {kind.__name__}")
+        if self.pixel_format:
+            check_format(self.pixel_format)
+        for name in ("exposure", "frame_rate", "pixel_size"):
+            if getattr(self, name) <= 0 or math.isinf(getattr(self, name)):
+                raise InputError(name, f"{getattr(self, name)}", "a positive number")
+        if self.latency < 0:
+            raise InputError("latency", f"{self.latency}", "0 s or more")
+        if self.region and not (
+            len(self.region) == 4
+            and all(isinstance(n, int) for n in self.region)
+            and min(self.region[:2]) >= 0
+            and min(self.region[2:]) > 0
+        ):
+            raise InputError("region", f"{self.region}", "x, y, width, height in whole pixels")
+        if self.timestamp_at not in ("start", "end"):
+            raise InputError("timestamp_at", repr(self.timestamp_at), "start or end")
+        for entry in self.features:
+            if not isinstance(entry, str) or "=" not in entry:
+                raise InputError("features", repr(entry), "Name=value")
+        if self.buffers < 2:
+            raise InputError("buffers", f"{self.buffers}", "2 or more")
+
+    @property
+    def triggered(self) -> bool:
+        return self.trigger != "off"
+
+
+def parse_settings(options: dict[str, Any]) -> CameraSettings:
+    """CameraSettings from a user's options; InputError names the one that is unknown or wrong."""
+    known = {field.name for field in fields(CameraSettings)}
+    for name in options:
+        if name not in known:
+            raise InputError("camera", f"option '{name}'", f"one of {', '.join(sorted(known))}")
+    return CameraSettings(**options)
+
+
+class Features(Protocol):
+    """A camera's GenICam features by name, whatever the library.
+
+    ``set`` and ``limits`` take and give what the feature holds: int, float or the entry of an enumeration.
+    """
+
+    def has(self, name: str, to_set: bool = False) -> bool: ...
+    def get(self, name: str) -> Any: ...
+    def set(self, name: str, value: Any) -> None: ...
+    def limits(self, name: str) -> tuple[float, float]: ...
+    def choices(self, name: str) -> tuple[str, ...]: ...
+
+
+#: Setting, names of its feature (GenICam SFNC first, then those of older cameras) and units per SI unit.
+_EXPOSURE = ("exposure", ("ExposureTime", "ExposureTimeAbs"), 1e6)
+_GAIN = ("gain", ("Gain", "GainRaw"), 1.0)
+_FRAME_RATE = ("frame_rate", ("AcquisitionFrameRate", "AcquisitionFrameRateAbs"), 1.0)
+
+#: What exposure and bandwidth leave of the frame rate, where the camera tells.
+_RESULTING_RATE = ("ResultingFrameRate", "ResultingFrameRateAbs", "AcquisitionResultingFrameRate")
+
+
+def apply_settings(features: Features, settings: CameraSettings, name: str) -> DeviceState:
+    """Set everything on the camera and read back what it made of it; InputError where it cannot."""
+    for entry in settings.features:
+        _set_by_text(features, *entry.split("=", 1))
+    _set_if_there(features, "AcquisitionMode", "Continuous")
+    pixel_format = settings.pixel_format or _deepest(features, name)
+    _choose(features, "pixel_format", "PixelFormat", pixel_format)
+    _set_region(features, settings.region)
+    if not math.isnan(settings.exposure):
+        _set_if_there(features, "ExposureAuto", "Off")
+        _set_number(features, *_EXPOSURE, settings.exposure)
+    if not math.isnan(settings.gain):
+        _set_if_there(features, "GainAuto", "Off")
+        _set_number(features, *_GAIN, settings.gain)
+    _set_trigger(features, settings)
+    if not settings.triggered and not math.isnan(settings.frame_rate):
+        _set_if_there(features, "AcquisitionFrameRateEnable", True)
+        _set_number(features, *_FRAME_RATE, settings.frame_rate)
+    return DeviceState(
+        name=name,
+        width=int(features.get("Width")),
+        height=int(features.get("Height")),
+        pixel_format=pixel_format,
+        saturation_adu=settings.saturation_adu or full_scale(pixel_format),
+        exposure=_read_number(features, *_EXPOSURE[1:]),
+        frame_rate=settings.frame_rate
+        if settings.triggered
+        else _read_number(features, (*_RESULTING_RATE, *_FRAME_RATE[1]), 1.0),
+    )
+
+
+def _set_by_text(features: Features, name: str, text: str) -> None:
+    """Set the feature ``name`` to what ``text`` means for its type."""
+    if not features.has(name, to_set=True):
+        raise InputError("features", name, "a feature of this camera that can be set")
+    kind = type(features.get(name))
+    if kind is bool:
+        if text.lower() not in ("true", "false"):
+            raise InputError("features", f"{name}={text}", "true or false")
+        features.set(name, text.lower() == "true")
+        return
+    try:
+        features.set(name, kind(text))
+    except ValueError:
+        raise InputError("features", f"{name}={text}", f"a value of type {kind.__name__}") from None
+
+
+def _deepest(features: Features, name: str) -> str:
+    offered = features.choices("PixelFormat")
+    for pixel_format in FORMATS:
+        if pixel_format in offered:
+            return pixel_format
+    raise InputError(f"camera {name}", f"only the pixel formats {', '.join(offered)}", "a monochrome one")
+
+
+def _set_region(features: Features, region: tuple[int, ...]) -> None:
+    """Offsets to 0 first: they bound the size."""
+    for offset in ("OffsetX", "OffsetY"):
+        _set_if_there(features, offset, 0)
+    largest = (int(features.limits(size)[1]) for size in ("Width", "Height"))
+    x, y, width, height = region or (0, 0, *largest)
+    wanted = {"Width": width, "Height": height, "OffsetX": x, "OffsetY": y}
+    for feature, value in wanted.items():
+        if (features.get(feature) if features.has(feature) else 0) == value:
+            continue
+        if not features.has(feature, to_set=True):
+            raise InputError("region", f"{feature} {value}", "nothing: this camera cannot set it")
+        least, most = features.limits(feature)
+        if not least <= value <= most:
+            raise InputError("region", f"{feature} {value}", f"{least:.0f} to {most:.0f} px")
+        features.set(feature, value)
+        if (got := features.get(feature)) != value:
+            raise InputError("region", f"{feature} {value}", f"a step that the camera has, such as {got}")
+
+
+def _set_trigger(features: Features, settings: CameraSettings) -> None:
+    if not settings.triggered:
+        _set_if_there(features, "TriggerMode", "Off")
+        return
+    if not features.has("TriggerMode"):
+        raise InputError("trigger", repr(settings.trigger), "off: this camera has no trigger")
+    _set_if_there(features, "TriggerSelector", "FrameStart")
+    source = "Software" if settings.trigger == "software" else settings.trigger
+    _choose(features, "trigger", "TriggerSource", source)
+    features.set("TriggerMode", "On")
+
+
+def _choose(features: Features, setting: str, feature: str, value: str) -> None:
+    offered = features.choices(feature)
+    if value not in offered:
+        raise InputError(setting, repr(value), f"one of the camera's {', '.join(offered)}")
+    if features.get(feature) != value:
+        features.set(feature, value)
+
+
+def _set_number(features: Features, setting: str, names: Sequence[str], scale: float, value: float) -> None:
+    name = _first(features, names, to_set=True)
+    if name is None:
+        raise InputError(setting, f"{value}", "nothing: this camera cannot set it")
+    least, most = features.limits(name)
+    if not least <= value * scale <= most:
+        raise InputError(setting, f"{value:g}", f"{least / scale:g} to {most / scale:g}")
+    current = features.get(name)
+    features.set(name, round(value * scale) if isinstance(current, int) else value * scale)
+
+
+def _read_number(features: Features, names: Sequence[str], scale: float) -> float:
+    name = _first(features, names)
+    return NAN if name is None else features.get(name) / scale
+
+
+def _first(features: Features, names: Sequence[str], to_set: bool = False) -> str | None:
+    return next((name for name in names if features.has(name, to_set)), None)
+
+
+def _set_if_there(features: Features, name: str, value: Any) -> None:
+    if features.has(name, to_set=True):
+        features.set(name, value)

@@ -19,10 +19,10 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "analyze": "mems6dof_ros.cli.analyze",
     "report": "mems6dof_ros.cli.report",
     "demo": "mems6dof_ros.cli.demo",
+    "monitor": "mems6dof_ros.cli.monitor",
+    "cameras": "mems6dof_ros.cli.cameras",
     "validate": {
         "localization": "mems6dof_ros.cli.validate_localization",
-        "calibration": "mems6dof_ros.cli.validate_calibration",
-        "pose": "mems6dof_ros.cli.validate_pose",
     },
 }
 
@@ -67,7 +67,7 @@ def _add_commands(
         if isinstance(target, str):
             importlib.import_module(target).add_parser(subparsers)
         else:
-            group = subparsers.add_parser(name, help=f"{name} {', '.join(target)} against simulation truth")
+            group = subparsers.add_parser(name, help="accuracy against simulation truth")
             _add_commands(group, target, arguments[1:])
 
 

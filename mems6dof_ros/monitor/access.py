@@ -13,7 +13,7 @@ import ipaddress
 import secrets
 import socket
 from functools import cache
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from mems6dof_ros.errors import InputError
 
@@ -53,9 +53,16 @@ def choose_token(address: str, token: str) -> str:
     return token if token or is_loopback(address) else secrets.token_urlsafe(24)
 
 
+def page_url(address: str, port: int, token: str) -> str:
+    """What to open in a browser to see the page that is served on ``address``."""
+    ip = ipaddress.ip_address(address)
+    host = socket.gethostname() if ip.is_unspecified else f"[{ip}]" if ip.version == 6 else str(ip)
+    return f"http://{host}:{port}/" + (f"?token={quote(token)}" if token else "")
+
+
 def token_matches(given: str, token: str) -> bool:
     """Compare in a time that tells nothing of the token."""
-    return hmac.compare_digest(given.encode(), token.encode())
+    return hmac.compare_digest(given.encode(errors="surrogateescape"), token.encode())
 
 
 def host_allowed(host: str) -> bool:

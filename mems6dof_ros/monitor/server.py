@@ -92,7 +92,7 @@ class MonitorServer:
         self._refusals: deque[float] = deque(maxlen=_REFUSALS_LOGGED)
         self._refusals_hidden = 0
         self._stopping = asyncio.Event()
-        self._loop = asyncio.new_event_loop()
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
         self._url: Future[str] = Future()
 
@@ -103,14 +103,13 @@ class MonitorServer:
 
     def stop(self) -> None:
         """Close every page and the port."""
-        if self._thread.is_alive():
+        if self._loop and self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._stopping.set)
             self._thread.join(timeout=5)
 
     def _run(self) -> None:
         with _logged_by(self._log):
-            self._loop.run_until_complete(self._serve())
-        self._loop.close()
+            asyncio.run(self._serve())
 
     async def _serve(self) -> None:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_MESSAGE)
@@ -129,9 +128,8 @@ class MonitorServer:
                 InputError(where, error.strerror or str(error), "an address and port free here")
             )
             return
-        host, port = runner.addresses[0][:2]
-        host = f"[{host}]" if ":" in host else host
-        self._url.set_result(f"http://{host}:{port}/" + (f"?token={self._token}" if self._token else ""))
+        self._loop = asyncio.get_running_loop()
+        self._url.set_result(access.page_url(*runner.addresses[0][:2], self._token))
         await self._stopping.wait()
         for page in list(self._pages):
             await page.close(code=1001, message=b"the monitor stops")

@@ -63,7 +63,7 @@ _MEMORY_FRAMES = 64  # frames whose messages are kept until the picture of one o
 _STATE_PERIOD = 0.5  # s
 _PICTURE_PATIENCE = 0.5  # s that a picture waits for its pose
 _STANDSTILL = 10.0  # s without a frame after which none are expected
-_NO_IMAGES = 1.5  # s without an image after which there are none
+_NO_IMAGES = 3.0  # s without an image after which there are none
 _MAX_DIAGNOSTICS = 32
 
 _Key = TypeVar("_Key")
@@ -112,11 +112,12 @@ class MonitorNode(InstrumentNode):
         def subscribe(kind: type, topic: str, callback: Callable[..., None], raw: bool = False) -> None:
             self.create_subscription(kind, topic, callback, transport.MESSAGES, raw=raw)
 
-        subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
-        # Raw: only the few that are drawn are ever decoded.
-        subscribe(Localizations, topics.LOCALIZATIONS, self._on_localizations, raw=True)
+        # In the order in which a cycle comes about: an executor that lags takes them in this order.
         subscribe(FrameInfo, topics.FRAME_INFO, self._on_frame_info)
         subscribe(GroundTruth, topics.TRUTH, self._on_truth)
+        # Raw: only the few that are drawn are ever decoded.
+        subscribe(Localizations, topics.LOCALIZATIONS, self._on_localizations, raw=True)
+        subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics)
         self._triggers = {name: self.create_client(Trigger, name) for name in SERVICES}
         # Wall time: the page lives also while simulated time stands still.
@@ -227,17 +228,19 @@ class MonitorNode(InstrumentNode):
 
     def _paint(self) -> None:
         """Make pictures, in a thread of its own, until None comes; without images, of points only."""
-        patience = _NO_IMAGES
+        last_image_at = time.monotonic()
         try:
             while True:
                 try:
-                    data = self._images.get(timeout=patience)
-                    patience = _NO_IMAGES
+                    data = self._images.get(timeout=_STATE_PERIOD)
                 except Empty:
-                    data, patience = b"", _STATE_PERIOD
+                    data = b""
                 if data is None:
                     return
-                if self._feed.watchers:
+                now = time.monotonic()
+                if data or not self._feed.watchers:
+                    last_image_at = now
+                if self._feed.watchers and (data or now - last_image_at > _NO_IMAGES):
                     self._paint_one(data)
         except Exception as error:  # handed to the main thread, which ends the node
             self.failure = error

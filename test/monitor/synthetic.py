@@ -147,8 +147,6 @@ class Machine:
         }
         sd = SD * (3 if status is Status.DEGRADED else 1)
         measured = true + rng.normal(0, 1, 6) * sd
-        if number == 0:
-            measured[:] = 0
         nan = status is Status.LOST
         covariance = np.diag(sd**2)
         blank = np.nan if nan else 1.0

@@ -235,4 +235,4 @@ setWindow(window_);
 requestAnimationFrame(tick);
 
 // For the browser test, which asks whether things move.
-window.mems6dof = { micrograph, charts, view, histories: () => histories };
+window.mems6dof = { link, micrograph, view };

@@ -1,0 +1,261 @@
+"""The live page in a real browser: it moves, it is drawn, it steers, and its memory stays flat."""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from mems6dof_ros.monitor.picture import make_picture
+
+playwright = pytest.importorskip("playwright.sync_api", reason="the browser test needs playwright")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="the browser test needs chromium")
+
+#: Number of pixels of a canvas that look like ``colour`` (r, g, b).
+COUNT_COLOUR = """([selector, colour]) => {
+  const { width, height } = document.querySelector(selector);
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(document.querySelector(selector), 0, 0);
+  const { data } = copy.getImageData(0, 0, width, height);
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4)
+    if (colour.every((c, k) => Math.abs(data[i + k] - c) < 40)) count++;
+  return count;
+}"""
+PARTICLE, RESIDUAL = [0x35, 0xD0, 0xFF], [0xFF, 0xE1, 0x4D]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as library:
+        arguments = [
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-background-networking",
+            "--js-flags=--expose-gc",
+        ]
+        browser = library.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_page(browser):
+    """Open an address in a fresh profile; at the end, the console must have stayed silent."""
+    contexts, complaints = [], []
+
+    def open_page(url: str, **options):
+        context = browser.new_context(**{"viewport": {"width": 1366, "height": 768}} | options)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda m: complaints.append(m.text) if m.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("requestfailed", lambda request: complaints.append(request.url))
+        page.goto(url)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def length(page) -> int:
+    return page.evaluate("mems6dof.view.history?.length ?? 0")
+
+
+def wait_for_cycles(page, count: int) -> None:
+    page.wait_for_function("count => (mems6dof.view.history?.length ?? 0) >= count", arg=count, timeout=20000)
+
+
+def wait_for_text(page, element: str, text: str) -> None:
+    page.wait_for_function(
+        "([id, text]) => document.getElementById(id).textContent.includes(text)", arg=[element, text]
+    )
+
+
+def picture(page, selector: str) -> bytes:
+    return page.evaluate("selector => document.querySelector(selector).toDataURL()", selector)
+
+
+def test_page_loads_in_two_seconds_and_moves(instrument, open_page):
+    started = time.monotonic()
+    page = open_page(instrument.url)
+    assert time.monotonic() - started < 2.0
+    wait_for_cycles(page, 100)
+    assert page.inner_text("#status-name") in ("TRACKING", "DEGRADED", "LOST")
+    for selector in ("[data-quantity=dx] canvas", "[data-quantity=psi] canvas", "#axis-map canvas"):
+        before = picture(page, selector)
+        page.wait_for_function(
+            "([selector, before]) => document.querySelector(selector).toDataURL() !== before",
+            arg=[selector, before],
+            timeout=5000,
+        )
+    cycle = int(page.inner_text("#figure-cycle"))
+    page.wait_for_function("cycle => +document.getElementById('figure-cycle').textContent > cycle", arg=cycle)
+    assert "± " in page.inner_text("[data-quantity=tilt_x] .note")
+    assert page.inner_text("[data-quantity=tilt_x] .value").endswith("mrad")
+    assert page.inner_text("[data-quantity=dz] .value").endswith("nm")
+
+
+def test_particles_identities_and_residuals_are_drawn_on_the_micrograph(instrument, open_page):
+    page = open_page(instrument.url)
+    page.wait_for_function("() => mems6dof.micrograph.overlay?.bodies?.[0] && mems6dof.micrograph.bitmap")
+    page.click("#pause")  # one picture to compare with itself
+    time.sleep(0.5)
+    canvas = "#micrograph-canvas"
+    for box, colour in {"#show-particles": PARTICLE, "#show-residuals": RESIDUAL}.items():
+        shown = page.evaluate(COUNT_COLOUR, [canvas, colour])
+        page.locator(box).evaluate("box => box.click()")
+        hidden = page.evaluate(COUNT_COLOUR, [canvas, colour])
+        page.locator(box).evaluate("box => box.click()")
+        assert shown > 300
+        assert hidden < shown / 4
+    with_names = picture(page, canvas)
+    page.locator("#show-identities").evaluate("box => box.click()")
+    assert picture(page, canvas) != with_names
+    # A particle tells what is known of it.
+    where = page.evaluate(
+        """() => {
+          const { overlay, canvas } = mems6dof.micrograph, box = canvas.getBoundingClientRect();
+          const { scale, left, top } = mems6dof.micrograph.geometry();
+          const i = overlay.bodies[0].particle_id.findIndex((id) => id >= 0);
+          return [box.left + left + (overlay.x_px[i] + .5) * scale,
+            box.top + top + (overlay.y_px[i] + .5) * scale];
+        }"""
+    )
+    page.mouse.move(*where)
+    assert page.inner_text("#tooltip").startswith("particle ")
+    assert "electrons" in page.inner_text("#tooltip")
+
+
+def test_buttons_call_the_services(instrument, open_page):
+    page = open_page(instrument.url)
+    wait_for_cycles(page, 20)
+    assert page.is_disabled("[data-service='recorder/stop']")
+    page.click("[data-service='frame_source/stop']")
+    wait_for_text(page, "answer", "frame_source/stop done")
+    wait_for_text(page, "status-name", "STALE")
+    page.click("[data-service='frame_source/start']")
+    count = length(page)
+    wait_for_cycles(page, count + 20)
+    assert "frame_source/start" in page.inner_text("#events")
+
+
+def test_pause_zoom_and_export_of_what_is_shown(instrument, open_page, tmp_path):
+    page = open_page(instrument.url)
+    wait_for_cycles(page, 120)
+    page.click("#pause")
+    time.sleep(0.3)
+    before, count = picture(page, "[data-quantity=dx] canvas"), length(page)
+    wait_for_cycles(page, count + 30)
+    assert picture(page, "[data-quantity=dx] canvas") == before
+    wait_for_text(page, "pause", "Resume, ")
+    page.click("#pause")
+
+    plot = page.locator("[data-quantity=dx] .u-over").bounding_box()
+    y = plot["y"] + plot["height"] / 2
+    page.mouse.move(plot["x"] + plot["width"] * 0.7, y)
+    page.mouse.down()
+    page.mouse.move(plot["x"] + plot["width"] * 0.9, y, steps=4)
+    page.mouse.up()
+    assert page.is_visible("#follow")
+    time.sleep(0.3)
+    low, high = page.evaluate("[mems6dof.view.low, mems6dof.view.high]")
+    assert 2 < high - low < 100
+    with page.expect_download() as download:
+        page.click("#export-csv")
+    download.value.save_as(tmp_path / "shown.csv")
+    text = (tmp_path / "shown.csv").read_text().splitlines()
+    rows = list(csv.DictReader(line for line in text if not line.startswith("#")))
+    assert [int(row["cycle"]) for row in rows] == list(range(math.ceil(low), math.floor(high) + 1))
+    assert "dx m" in "".join(text[:5])
+    values = page.evaluate(
+        """() => { const { history, low, high } = mems6dof.view;
+        return [...history.columns.psi.slice(...history.range(low, high))]; }"""
+    )
+    assert [float(row["psi"] or "nan") for row in rows] == pytest.approx(values, rel=0, abs=0, nan_ok=True)
+
+    with page.expect_download() as download:
+        page.click("#export-png")
+    download.value.save_as(tmp_path / "shown.png")
+    image = cv2.imread(str(tmp_path / "shown.png"))
+    assert image.shape[1] > 1200
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
+    page.click("#follow")
+    assert not page.is_visible("#follow")
+
+
+def test_limits_raise_alarms(instrument, open_page):
+    page = open_page(instrument.url)
+    wait_for_cycles(page, 20)
+    page.select_option("#limit-quantity", "dz")
+    page.fill("#limit-low", "-0.001")
+    page.fill("#limit-high", "0,001")  # nm; a comma will do
+    page.click("#limit-form button")
+    page.wait_for_selector("#alarm-chip:visible", timeout=5000)
+    wait_for_text(page, "limits", "outside")
+    assert "dz = " in page.inner_text("#events")
+    page.click("#limits button")
+    wait_for_text(page, "limits", "No limits set.")
+
+
+@pytest.mark.parametrize(("scheme", "bright"), [("light", True), ("dark", False)])
+def test_the_page_follows_the_colour_scheme_and_can_be_switched(instrument, open_page, scheme, bright):
+    page = open_page(instrument.url, color_scheme=scheme)
+    background = (
+        "getComputedStyle(document.documentElement).backgroundColor.match(/\\d+/g).map(Number)[0] > 128"
+    )
+    assert page.evaluate(background) is bright
+    page.click("#theme")
+    assert page.evaluate(background) is not bright
+    page.reload()
+    assert page.evaluate(background) is not bright
+
+
+def test_page_comes_back_by_itself(serve, open_page, machine):
+    served = serve()
+    page = open_page(served.url)
+    for number in range(10):
+        served.feed.add_pose(machine.cycle(number, image=False)[2])
+    wait_for_cycles(page, 10)
+    page.evaluate("() => { mems6dof.link.socket.close(); }")
+    page.wait_for_selector("#offline:visible")
+    page.wait_for_selector("#offline", state="hidden", timeout=5000)
+    wait_for_cycles(page, 10)
+    assert length(page) == 10  # and nothing twice
+
+
+def test_memory_stays_flat_however_long_it_runs(serve, open_page, machine):
+    """Ten minutes at 90 cycles/s, run through as fast as the page takes them."""
+    served = serve()
+    frame, found, pose = machine.cycle(0)
+    page = open_page(served.url)
+
+    def run_to(first: int, last: int) -> None:
+        for number in range(first, last):
+            served.feed.add_pose(replace(pose, cycle=number, frame_counter=number))
+            if number % 250 == 0:
+                served.feed.add_picture(make_picture(frame, found, [pose], served.feed.bodies))
+            if number % 500 == 0:  # the server keeps 1000 cycles here; the page must not miss any
+                page.wait_for_function("n => mems6dof.view.history?.last('cycle') >= n", arg=number)
+        page.wait_for_function("n => mems6dof.view.history.last('cycle') >= n", arg=last - 1)
+
+    def heap() -> float:
+        page.evaluate("gc()")
+        return page.evaluate("performance.memory.usedJSHeapSize") / 1e6
+
+    run_to(0, 5000)
+    early = heap()
+    run_to(5000, 54000)
+    late = heap()
+    print(f"heap {early:.1f} MB after 5000 cycles, {late:.1f} MB after 54000")
+    assert length(page) <= 1000
+    assert late - early < 1.5

@@ -7,9 +7,10 @@ Two things are definitions, not measurements, and cannot be compared directly:
 - where the microscope frame lies *in the microscope*: chosen by the optical calibration, whose plane z = 0
   and whose zero of x and y no rotating body can check.
 
-Both are constant. So ``T_measured = L T_true G`` with two rigid motions, L (the microscope's, one for all) and G (the body's, one for each reference version), fitted to all cycles at once; what then
-differs is error. Neither can hide anything that changes from cycle to cycle. L is reported
-(``TruthComparison.microscope``): its translation cancels in every displacement, its tilts say how far the
+Both are constant. So ``T_measured = L T_true G`` with two rigid motions, L (the microscope's, one for all)
+and G (the body's, one for each reference version), fitted to all cycles at once; what then differs is
+error. Neither can hide anything that changes from cycle to cycle. L is reported as
+``TruthComparison.microscope``: its translation cancels in every displacement, its tilts say how far the
 calibrated plane is off, and ``fit_microscope=False`` counts them as error.
 """
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, fields
-from statistics import median
 from typing import NamedTuple
 
 import numpy as np

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
+#: Pairs of localizations tried before a constellation counts as not found.
+PAIRS = 400
+
+
 class PlaneMotion(NamedTuple):
     """Rotation by ``angle`` rad about the origin, then translation ``shift`` (2,) m."""
 
@@ -91,9 +95,21 @@ class ConstellationIndex:
             return GlobalMatch(PlaneMotion(0.0, np.zeros(2)), 0, 1)
         angle, x, y, inliers, tests = _search(
             self.points, self.distance, self.first, self.second, np.ascontiguousarray(measured),
-            tolerance, gate, enough,
+            *self._pairs(measured), tolerance, gate, enough,
         )  # fmt: skip
         return GlobalMatch(PlaneMotion(angle, np.array([x, y])), inliers, max(tests, 1))
+
+    def _pairs(self, measured: Array) -> tuple[Indices, Indices]:
+        """Pairs of localizations to try: all of a few, else long ones at random, since short ones give a
+        poor angle and the longest are not in the constellation."""
+        n = len(measured)
+        if n * (n - 1) // 2 <= PAIRS:
+            one, other = np.triu_indices(n, 1)
+            return one, other
+        one, other = np.random.default_rng(0).integers(0, n, (2, 5 * PAIRS))
+        length = np.hypot(*(measured[one] - measured[other]).T)
+        usable = np.flatnonzero((length > 0.15 * self.distance[-1]) & (length < self.distance[-1]))[:PAIRS]
+        return one[usable], other[usable]
 
 
 @njit(cache=True, nogil=True)
@@ -162,8 +178,10 @@ def _closest_points(predicted, measured, gates):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(points, distance, first, second, measured, tolerance, gate, enough):  # type: ignore[no-untyped-def]
-    pairs_wanted, first_look, first_needed = 400, 24, 3
+def _search(  # type: ignore[no-untyped-def]
+    points, distance, first, second, measured, one, other, tolerance, gate, enough
+):
+    first_look, first_needed = 24, 3
     m, n = len(points), len(measured)
     # Particles in square cells, as linked lists: a lookup costs a few comparisons.
     low_x, low_y = points[:, 0].min() - gate, points[:, 1].min() - gate
@@ -178,37 +196,10 @@ def _search(points, distance, first, second, measured, tolerance, gate, enough):
         following[j] = head[a, b]
         head[a, b] = j
 
-    total = n * (n - 1) // 2
-    longest = distance[-1]
     best, best_angle, best_x, best_y, tests = 0, 0.0, 0.0, 0.0, 0
-    state = np.uint64(88172645463325252)
-    tried = 0
-    draws = 0
-    while tried < min(pairs_wanted, total) and draws < 20 * pairs_wanted:
-        draws += 1
-        if total <= pairs_wanted:  # few localizations: every pair once, in order
-            k = draws - 1
-            if k >= total:
-                break
-            i = 0
-            while k >= n - 1 - i:
-                k -= n - 1 - i
-                i += 1
-            j = i + 1 + k
-        else:
-            state ^= state << np.uint64(13)
-            state ^= state >> np.uint64(7)
-            state ^= state << np.uint64(17)
-            i = int(state % np.uint64(n))
-            j = int((state >> np.uint64(20)) % np.uint64(n))
-            if i == j:
-                continue
+    for i, j in zip(one, other):  # noqa: B905 (numba knows no strict)
         bx, by = measured[j, 0] - measured[i, 0], measured[j, 1] - measured[i, 1]
         length = math.sqrt(bx * bx + by * by)
-        # Short pairs give a poor angle; pairs longer than the constellation are not in it.
-        if total > pairs_wanted and (length < 0.15 * longest or length > longest + tolerance):
-            continue
-        tried += 1
         k = np.searchsorted(distance, length - tolerance)
         while k < len(distance) and distance[k] <= length + tolerance:
             for swap in range(2):

@@ -8,7 +8,7 @@ from typing import TextIO
 
 
 class Progress:
-    """Called as ``progress(done, total, note)``; ``total`` 0: unknown. Use as a context manager."""
+    """Called as ``progress(done, total, text)``; ``total`` 0: unknown. Use as a context manager."""
 
     def __init__(self, label: str, stream: TextIO | None = None) -> None:
         self._label, self._stream = label, stream or sys.stderr
@@ -24,20 +24,20 @@ class Progress:
         if self._last and self._terminal:
             self._stream.write("\n")
 
-    def __call__(self, done: int, total: int = 0, note: str = "") -> None:
+    def __call__(self, done: int, total: int = 0, text: str = "") -> None:
         now = time.monotonic()
         if done != total and now - self._shown < self._interval:
             return
         self._shown = now
         rate = done / max(now - self._start, 1e-9)
-        text = f"{self._label}: {done}"
+        line = f"{self._label}: {done}"
         if total:
-            text += f" of {total}, {done / total:.0%}"
-        text += f", {rate:.1f}/s"
+            line += f" of {total}, {done / total:.0%}"
+        line += f", {rate:.1f}/s"
         if total and 0 < done < total:
-            text += f", {(total - done) / rate:.0f} s left"
-        if note:
-            text += f": {note}"
-        self._stream.write(f"\r{text.ljust(len(self._last))}" if self._terminal else f"{text}\n")
+            line += f", {(total - done) / rate:.0f} s left"
+        if text:
+            line += f"  {text}"
+        self._stream.write(f"\r{line.ljust(len(self._last))}" if self._terminal else f"{line}\n")
         self._stream.flush()
-        self._last = text
+        self._last = line

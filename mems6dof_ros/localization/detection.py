@@ -15,9 +15,14 @@ from scipy.spatial import cKDTree
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import check_image
+from mems6dof_ros.localization import kernels
 
 #: Median absolute deviation to standard deviation of a normal distribution.
 _MAD_TO_SD = 1.4826
+#: Mean absolute deviation likewise.
+_MEAN_TO_SD = 1.2533
+
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ def detect(image: NDArray[np.generic], settings: DetectionSettings | None = None
     if min(cells.shape) < 3:
         return np.empty((0, 2))
     score = _score(cells, settings)
-    highest = cv2.dilate(score, np.ones((3, 3), np.uint8))
+    highest = cv2.dilate(score, _NEIGHBOURS)
     rows, columns = np.nonzero((score == highest) & (score > settings.threshold))
     order = np.argsort(-score[rows, columns], kind="stable")
     rows, columns = rows[order], columns[order]
@@ -74,39 +79,36 @@ def detect(image: NDArray[np.generic], settings: DetectionSettings | None = None
 
 
 def _bin(image: NDArray[np.generic], binning: int) -> NDArray[np.float32]:
-    """Means over cells of ``binning`` px; lines that do not fill a cell are left out."""
-    height, width = (n // binning for n in image.shape)
-    if height == 0 or width == 0:
-        return np.empty((0, 0), np.float32)
-    whole = image[: height * binning, : width * binning]
-    if binning == 1:
-        return whole.astype(np.float32)
-    # OpenCV rounds means to the type of the pixels: too coarse for 8 bit.
-    fine = whole.astype(np.uint16) << 8 if whole.dtype == np.uint8 else whole.astype(np.uint16, copy=False)
-    return np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
+    """Means over cells of ``binning`` px. (OpenCV would round them to the type of the pixels.)"""
+    cells = np.empty([n // binning for n in image.shape], np.float32)
+    kernels.bin_cells(kernels.pixels(image), binning, cells)
+    return cells
 
 
 def _score(cells: NDArray[np.float32], settings: DetectionSettings) -> NDArray[np.float32]:
     """Contrast of spots in standard deviations of the background, the best of all sizes."""
-    flat = cells - _background(cells, settings.background_px // settings.binning)
-    # Dark debris is cut off at the depth of noise: filtered, its rim would look like bright spots.
-    np.maximum(flat, -2 * _deviation(flat), out=flat)
+    size = settings.background_px // settings.binning
+    flat = cells - _typical(cells, size)
+    # Noise grows with the background. The floor, far below one count, keeps rounding from becoming contrast.
+    noise = _MEAN_TO_SD * _typical(np.abs(flat), size)
+    flat /= np.maximum(noise, max(0.3 * float(np.median(noise)), 0.01))
+    # Dark debris, edges and all, becomes background: filtered, its rim would look like bright spots.
+    debris = cv2.dilate((flat < -3).astype(np.uint8), _NEIGHBOURS)
+    flat[(debris > 0) & (flat < 0)] = 0
     best = np.zeros_like(flat)
     for sigma in settings.spot_sigmas_px:
         narrow = max(sigma / settings.binning, 0.5)
         response = _blur(flat, narrow) - _blur(flat, 2 * narrow)
-        # The floor, far below one count, keeps rounding from becoming contrast in images without noise.
         np.maximum(best, response / max(_deviation(response), 0.01), out=best)
     return best
 
 
-def _background(cells: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Median over about ``size`` cells, from means over a fifth of it."""
+def _typical(cells: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Median over about ``size`` cells, of means over a fifth of it."""
     height, width = cells.shape
     coarse = (max(round(5 * width / size), 1), max(round(5 * height / size), 1))
-    means = cv2.resize(cells, coarse, interpolation=cv2.INTER_AREA)
-    smooth = cv2.resize(cv2.medianBlur(means, 5), (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(smooth, dtype=np.float32)
+    medians = cv2.medianBlur(cv2.resize(cells, coarse, interpolation=cv2.INTER_AREA), 5)
+    return np.asarray(cv2.resize(medians, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _blur(cells: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:

@@ -35,42 +35,29 @@ def fit_gaussians(
     weighting: str = DEFAULT_WEIGHTING,
     window_px: int = 31,
     kappa: float = KAPPA,
-    start: GaussianFits | None = None,
 ) -> GaussianFits:
     """Fit one Gaussian to the window about each position.
 
     ``image`` (height, width) uint8 or uint16, ADU; ``positions_px`` (n, 2), column and row, good to
-    about a particle's radius; ``weighting`` one of WEIGHTINGS; ``window_px`` odd side of the window;
-    ``kappa`` variance floor over amplitude of ``relative_light_weighting``. ``start``: earlier fits of
-    the same particles, n of them, whose shapes start the new fits at ``positions_px``, which then must
-    be good to a pixel.
+    about a particle's radius; ``weighting`` one of WEIGHTINGS; ``window_px`` odd side of the window that
+    is read, of which the fit uses the square of side ``window_px - 1`` about the particle; ``kappa``
+    least variance over amplitude of ``relative_light_weighting``.
 
     Flags set: FIT_FAILED (not converged, or no particle in the window), WINDOW_CUT (more than a seventh
-    of the window outside the image), SATURATED. Raises InputError for an image, position, weighting or
-    window that cannot be used.
+    of the window outside the image), SATURATED. Raises InputError for an image, weighting or window that
+    cannot be used; a position that is NaN or outside the image is a failed fit.
     """
     check_image(image, "image")
     camera.check_shape(image.shape)
     positions = np.array(positions_px, dtype=np.float64).reshape(-1, 2)
-    if weighting not in WEIGHTINGS:
-        raise InputError("weighting", repr(weighting), f"one of {', '.join(WEIGHTINGS)}")
-    if not (SMALLEST_WINDOW_PX <= window_px <= LARGEST_WINDOW_PX and window_px % 2 == 1):
-        raise InputError("window_px", f"{window_px}", f"an odd {SMALLEST_WINDOW_PX} to {LARGEST_WINDOW_PX}")
+    check_fit(weighting, window_px)
     if not 0 < kappa < 10:
         raise InputError("kappa", f"{kappa}", "a positive number, about 0.1")
-    starts = positions
-    if start is not None:
-        if len(start) != len(positions):
-            raise InputError("start", f"{len(start)} fits", f"as many as positions, {len(positions)}")
-        starts = np.hstack([positions, start.parameters[:, 2:]])
     n = len(positions)
     parameters, covariance, quality = np.empty((n, 7)), np.empty((n, 7, 7)), np.empty((n, 4))
-    # Read-only or not is part of a compiled signature: one for all.
-    pixels = np.ascontiguousarray(image).view()
-    pixels.flags.writeable = False
     kernels.fit_windows(
-        pixels,
-        starts,
+        kernels.pixels(image),
+        positions,
         *camera.maps,
         float(camera.saturation_adu),
         window_px,
@@ -85,3 +72,11 @@ def fit_gaussians(
     flags[quality[:, 2] * 7 > window_px] |= np.uint32(Flag.WINDOW_CUT)
     flags[quality[:, 3] > 0] |= np.uint32(Flag.SATURATED)
     return GaussianFits(parameters, covariance, quality[:, 0], quality[:, 1].astype(np.int32), flags)
+
+
+def check_fit(weighting: str, window_px: int) -> None:
+    """Raise InputError unless there is such a weighting, and a fit in such a window is possible."""
+    if weighting not in WEIGHTINGS:
+        raise InputError("weighting", repr(weighting), f"one of {', '.join(WEIGHTINGS)}")
+    if not (SMALLEST_WINDOW_PX <= window_px <= LARGEST_WINDOW_PX and window_px % 2 == 1):
+        raise InputError("window_px", f"{window_px}", f"an odd {SMALLEST_WINDOW_PX} to {LARGEST_WINDOW_PX}")

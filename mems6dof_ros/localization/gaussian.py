@@ -86,16 +86,31 @@ def residuals(
     return ((data - model) / np.sqrt(variance)).ravel()
 
 
+def window_weights(columns: Array, rows: Array, x: float, y: float, window_px: int) -> Array:
+    """The part of each pixel inside the square of side ``window_px - 1`` about (x, y)."""
+    reach = (window_px - 1) / 2 + 0.5
+    return np.clip(reach - np.abs(columns - x), 0, 1) * np.clip(reach - np.abs(rows - y), 0, 1)
+
+
 def reference_fit(
-    data: Array, columns: Array, rows: Array, start: Array, noise: Array | float, weighting: str
+    data: Array,
+    columns: Array,
+    rows: Array,
+    start: Array,
+    noise: Array | float,
+    weighting: str,
+    inside: Array | float = 1.0,
 ) -> Array:
-    """Seven parameters that minimise ``residuals``, from ``start``, by SciPy's trust-region least squares."""
+    """Seven parameters that minimise the squares of ``residuals``, weighted by ``inside``.
+
+    From ``start``, by SciPy's trust-region least squares.
+    """
     low = [-np.inf, -np.inf, -np.inf, 0.1, 0.1, -0.99, -np.inf]
     high = [np.inf, np.inf, np.inf, np.inf, np.inf, 0.99, np.inf]
+    root = np.sqrt(inside * np.ones_like(data)).ravel()
     solution = least_squares(
-        residuals,
+        lambda parameters: root * residuals(parameters, columns, rows, data, noise, weighting),
         start,
-        args=(columns, rows, data, noise, weighting),
         bounds=(low, high),
         x_scale=np.abs(start) + 0.1,
         xtol=1e-13,

@@ -1,12 +1,12 @@
-"""Compiled kernels of the Gaussian fit: numbers in, numbers out, nothing else of the project inside.
+"""Compiled kernels of detection and fit: numbers in, numbers out, nothing else of the project inside.
 
-All kernels release the GIL (threads over frames) and are cached on disk. Arrays of the kernels:
+All kernels release the GIL (threads over frames) and are cached on disk. Arguments of ``fit_windows``:
 
 =============  ==================  =====================================================================
 name           shape, type         content
 =============  ==================  =====================================================================
 image          (h, w) u1 or u2     pixels, ADU
-starts         (n, 2) or (n, 7)    positions, px of the image, or all parameters of an earlier fit
+starts         (n, 2)              positions: column and row, px
 offset         (h, w) or (1, 1)    ADU
 gain           (h, w) or (1, 1)    ADU per electron
 read_variance  (h, w) or (1, 1)    electrons^2
@@ -45,19 +45,27 @@ LANES = 8
 VARIANCE_FLOOR = 0.01  # electrons^2, as in gaussian.py
 LEAST_SIGMA = 0.7  # px; with LARGEST_ATANH and windows to 65 px no exponential overflows
 LARGEST_ATANH = 1.8  # rho = 0.947
-MOST_ITERATIONS, ROUGH_ITERATIONS = 60, 4
+MOST_ITERATIONS, ROUGH_ITERATIONS = 60, 10
 # Expected decrease of chi-square at which to stop, in units of chi-square per pixel: the last step is
 # then about sqrt(TOLERANCE) standard deviations, and it is still taken.
-TOLERANCE, ROUGH = 1e-4, 1e-2
+TOLERANCE, ROUGH = 1e-4, 1e-3
 MOST_WINDOWS, MOST_OFF_CENTRE = 6, 1.0  # times a window is placed; px from particle to its middle
 
 Array: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.generic]
+FloatImage: TypeAlias = NDArray[np.float32]
 
 # Sums may be reordered (vectors); only where no NaN or infinity can come may the compiler exclude them.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _FAST_FINITE = _FAST | {"nnan"}
 _OPTIONS: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy"}
+
+
+def pixels(image: Image) -> Image:
+    """``image`` as the kernels take it: contiguous and read-only, since that is part of their signature."""
+    view = np.ascontiguousarray(image).view()
+    view.flags.writeable = False
+    return view
 
 
 @njit(fastmath=_FAST, **_OPTIONS)
@@ -590,6 +598,23 @@ def _uncertainty(
     return chi / max(pixels - 7, 1.0)
 
 
+@njit(fastmath=_FAST, **_OPTIONS)
+def bin_cells(image: Image, binning: int, cells: FloatImage) -> None:
+    """``cells``: means over squares of ``binning`` px; lines that do not fill one are left out."""
+    rows, columns = cells.shape
+    sums = np.empty(columns * binning, np.float32)
+    for i in range(rows):
+        sums[:] = 0.0
+        for k in range(i * binning, (i + 1) * binning):
+            for j in range(sums.size):
+                sums[j] += np.float32(image[k, j])
+        for j in range(columns):
+            s = np.float32(0.0)
+            for k in range(j * binning, (j + 1) * binning):
+                s += sums[k]
+            cells[i, j] = s / np.float32(binning * binning)
+
+
 @njit(**_OPTIONS)
 def fit_windows(
     image: Image,
@@ -630,13 +655,7 @@ def fit_windows(
         cut, largest = _read_window(
             image, column, row, offset, gain, read_variance, window, stride, data, read, valid
         )
-        if starts.shape[1] == 7 and not math.isnan(starts[n, 2]):
-            theta[:] = starts[n]
-            theta[0] -= column
-            theta[1] -= row
-            theta[3], theta[4] = math.log(theta[3]), math.log(theta[4])
-            theta[5] = math.atanh(theta[5])
-        elif not _start(data, valid, u, v, window, stride, theta):
+        if not _start(data, valid, u, v, window, stride, theta):
             continue
         # First a rough uniform fit: a robust start for every weighting, the place of the window, and the
         # light that scales the relative weights. Then the fit itself.

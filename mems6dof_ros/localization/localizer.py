@@ -14,8 +14,10 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.detection import DetectionSettings, detect
-from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, fit_gaussians
+from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, check_fit, fit_gaussians
 from mems6dof_ros.localization.localizations import Flag, GaussianFits, Localizations
+
+_GATES = ("least_significance", "most_sigma", "most_misfit")
 
 #: Relative difference of two pixel sizes that still counts as equal: 0.03 um over the field of 260 um.
 PIXEL_SIZE_TOLERANCE = 1e-4
@@ -45,20 +47,12 @@ class LocalizerSettings:
     most_misfit: float = 0.4
 
     def __post_init__(self) -> None:
-        for name in (
-            "neighbour_distance",
-            "neighbour_flux",
-            "least_significance",
-            "most_sigma",
-            "most_misfit",
-        ):
+        check_fit(self.weighting, self.window_px)
+        for name in ("neighbour_distance", "neighbour_flux", *_GATES):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"localizer.{name}", f"{getattr(self, name)}", "a number of 0 or more")
         if not (math.isnan(self.pixel_size) or 0 < self.pixel_size < math.inf):
             raise InputError("localizer.pixel_size", f"{self.pixel_size}", "positive m, or NaN for unknown")
-
-
-_LIMITS = ("neighbour_distance", "neighbour_flux", "least_significance", "most_sigma", "most_misfit")
 
 
 class Localizer:
@@ -88,7 +82,7 @@ class Localizer:
         fits = _take(fits, _first_of_each(fits, self.settings.detection.separation_px / 2))
         fits.flags[:] |= self._quality_flags(fits, pixel_size)
         if self.calibration:
-            found = self.calibration.locate(fits)
+            found = self.calibration.locate(fits, frame.image)
         else:
             found = _lateral_positions(fits, pixel_size, frame.image.shape)
         return Localizations(

@@ -36,6 +36,7 @@ setup(
             "localizer = mems6dof_ros.nodes.localizer:main",
             "pose_estimator = mems6dof_ros.nodes.pose_estimator:main",
             "recorder = mems6dof_ros.nodes.recorder:main",
+            "monitor = mems6dof_ros.nodes.monitor:main",
         ],
     },
 )

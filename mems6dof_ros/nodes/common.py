@@ -129,6 +129,7 @@ class Health:
     """
 
     PERIOD = 1.0  # s
+    MOST_LINES = 10  # that are logged of the problems of one period
 
     def __init__(self, node: Node, hardware_id: str = "") -> None:
         self.state = "starting"
@@ -181,8 +182,13 @@ class Health:
         with self._lock:
             self._totals[what] += number
             self._problems.append((level, why))
+            if len(self._problems) > self.MOST_LINES:
+                return
         log = self._node.get_logger()
-        (log.error if level == DiagnosticStatus.ERROR else log.warning)(why, throttle_duration_sec=1.0)
+        if level == DiagnosticStatus.ERROR:
+            log.error(why)
+        else:
+            log.warning(why)
 
     def publish(self) -> None:
         """Publish the report of the time since the last one."""
@@ -200,6 +206,8 @@ class Health:
                 times.clear()
             values.update(self._values)
             problems, self._problems = self._problems, []
+        if (more := len(problems) - self.MOST_LINES) > 0:
+            self._node.get_logger().warning(f"and {more} more problems in the last second")
         values.update({what: str(read()) for what, read in self._gauges.items()})
         level, message = max(problems, default=(DiagnosticStatus.OK, self.state), key=lambda p: p[0])
         status = DiagnosticStatus(

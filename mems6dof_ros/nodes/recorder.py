@@ -16,8 +16,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from mems6dof_ros.errors import InputError
@@ -94,7 +96,8 @@ class RecorderNode(InstrumentNode):
             self._open()
         self.start_worker(lambda act: act())
         self.create_service(Trigger, "~/start", self._on_start)
-        self.create_service(Trigger, "~/stop", self._on_stop)
+        # In a group of its own: it waits for messages that come meanwhile.
+        self.create_service(Trigger, "~/stop", self._on_stop, callback_group=MutuallyExclusiveCallbackGroup())
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._unknown = [name for name in self.values["topics"] if not self._subscribe_known(name)]
         if self._unknown:
@@ -254,12 +257,13 @@ class RecorderNode(InstrumentNode):
         response.success, response.message = True, str(self._bag.path)
         return response
 
-    def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         assert self.worker is not None
         if not self._bag:
             response.success, response.message = False, "not recording"
             return response
         path = self._bag.path
+        await self._quiet()  # what was sent before this call may still be on its way through our callbacks
         closed = threading.Event()
 
         def close() -> None:
@@ -271,6 +275,21 @@ class RecorderNode(InstrumentNode):
         response.message = str(path) if response.success else f"{path}: the disk is behind, still writing"
         self.tell("stopped")
         return response
+
+    def _quiet(self) -> Future:
+        """Done when no message has come for a moment, or after a second."""
+        quiet = Future()
+        before = [-1]
+
+        def look() -> None:
+            now = self.health.total("messages")
+            if now == before[-1] or len(before) > 1.0 / _QUIET:
+                timer.cancel()
+                quiet.set_result(None)
+            before.append(now)
+
+        timer = self.create_timer(_QUIET, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return quiet
 
 
 def main(args: list[str] | None = None) -> int:

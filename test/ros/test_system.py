@@ -1,0 +1,226 @@
+"""The chain of four processes, as the tables describe it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from peers import PATIENCE, SMALL_GEAR, alive, own_domain, wait_until
+
+from mems6dof_ros.calibration.file import load_calibration
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.localization.localizer import Localizer
+from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
+from mems6dof_ros.nodes.system import SYSTEMS, RunningSystem, chain, command, run_system, simulated
+from mems6dof_ros.pose.cycle_pose import Status
+from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.recording import messages
+from mems6dof_ros.recording.bag import BagReader
+from mems6dof_ros.sources.source import frames, open_source
+
+CYCLES = 24
+
+
+def run_to_the_end(system: RunningSystem) -> dict[str, int]:
+    system.wait("frame_source", timeout=PATIENCE)
+    return system.stop()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, calibration: str) -> tuple[Path, dict[str, int], str]:
+    """A recorded run with its images: directory, exit codes, output."""
+    path = tmp_path_factory.mktemp("system") / "bag"
+    lines: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(own_domain()))
+        nodes = chain(
+            simulated(CYCLES, **SMALL_GEAR),
+            calibration=calibration,
+            output=str(path),
+            recorded=(*DEFAULT_TOPICS, "image_raw"),
+        )
+        with run_system(nodes, on_line=lines.append) as system:
+            codes = run_to_the_end(system)
+    return path, codes, "\n".join(lines)
+
+
+def test_every_frame_becomes_a_recorded_pose(recording: tuple[Path, dict[str, int], str]) -> None:
+    path, codes, output = recording
+    assert codes == dict.fromkeys(("frame_source", "localizer", "pose_estimator", "recorder"), 0), output
+    assert "Traceback" not in output
+    with BagReader(path) as bag:
+        counts = {topic: number for topic, number in bag.counts.items() if topic != "/diagnostics"}
+        poses = [recorded.message for recorded in bag.messages(["/pose_6dof"])]
+    assert counts == dict.fromkeys(
+        (
+            "/image_raw",
+            "/camera_info",
+            "/frame_info",
+            "/truth",
+            "/localizations",
+            "/pose_6dof",
+            "/pose",
+            "/pose_with_covariance",
+        ),
+        CYCLES,
+    )
+    assert [pose.cycle for pose in poses] == list(range(1, CYCLES + 1))
+    assert {pose.status for pose in poses} == {Status.TRACKING}
+
+
+def test_headers_are_the_frames_own(recording: tuple[Path, dict[str, int], str]) -> None:
+    headers: dict[str, set[tuple[int, str]]] = {}
+    with BagReader(recording[0]) as bag:
+        for recorded in bag.messages():
+            if recorded.topic != "/diagnostics":
+                header = recorded.message.header
+                stamp = messages.nanoseconds(header.stamp)
+                headers.setdefault(recorded.topic, set()).add((stamp, header.frame_id))
+    of_images = headers.pop("/image_raw")
+    assert len(of_images) == CYCLES
+    assert all(others == of_images for others in headers.values())
+
+
+def test_poses_follow_the_truth(recording: tuple[Path, dict[str, int], str]) -> None:
+    with BagReader(recording[0]) as bag:
+        poses = {r.message.cycle: r.message for r in bag.messages(["/pose_6dof"])}
+        truth = {r.message.cycle: r.message for r in bag.messages(["/truth"])}
+    error = np.array([poses[k].psi - (truth[k].psi - truth[1].psi) for k in sorted(poses)])
+    # 17 particles of 2 nm at 20 um: 25 urad each, and the first frame, the reference, as much again.
+    assert np.sqrt(np.mean(error**2)) < 100e-6
+
+
+def test_latency_is_stated_per_stage(recording: tuple[Path, dict[str, int], str]) -> None:
+    stages = ("frame_transport", "queue", "localization", "localization_transport", "pose")
+    with BagReader(recording[0]) as bag:
+        for pose in (recorded.message for recorded in bag.messages(["/pose_6dof"])):
+            parts = [getattr(pose, f"latency_{stage}") for stage in stages]
+            assert all(part >= 0 for part in parts)
+            assert sum(parts) == pytest.approx(pose.latency_total, abs=1e-6)
+            assert np.isnan(pose.latency_capture)  # simulated ahead of time
+
+
+def test_nodes_give_what_the_core_gives(
+    recording: tuple[Path, dict[str, int], str], calibration: str
+) -> None:
+    """Offline, over the recorded images: the same numbers."""
+    optics = load_calibration(calibration)
+    localizer, estimator = Localizer(optics.camera, optics), PoseEstimator()
+    offline = {}
+    for frame in frames(open_source("bag", path=recording[0])):
+        pose = estimator.update(localizer.localize(frame))
+        offline[pose.stamp_ns] = pose
+    with BagReader(recording[0]) as bag:
+        live = [messages.to_cycle_pose(recorded.message) for recorded in bag.messages(["/pose_6dof"])]
+    assert len(live) == len(offline) == CYCLES
+    for pose in live:
+        same = offline[pose.stamp_ns]
+        np.testing.assert_allclose(pose.displacement, same.displacement, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(
+            pose.displacement_covariance, same.displacement_covariance, rtol=1e-9, atol=0
+        )
+        assert (pose.particle_id == same.particle_id).all()
+
+
+def test_calibration_and_parameters_travel_with_the_record(
+    recording: tuple[Path, dict[str, int], str], calibration: str
+) -> None:
+    with BagReader(recording[0]) as bag:
+        assert bag.attachments()["optics.yaml"] == Path(calibration).read_bytes()
+        assert "image_raw" in bag.provenance()["topics"]
+
+
+def test_two_instances_in_one_domain(calibration: str, tmp_path: Path) -> None:
+    names, cycles = ("left", "right"), 8
+    lines: list[str] = []
+
+    def nodes(k: int) -> list:
+        source = simulated(cycles, seed=1 + k, **SMALL_GEAR)
+        return chain(source, calibration=calibration, output=str(tmp_path / names[k]))
+
+    with (
+        run_system(nodes(0), namespace=names[0], on_line=lines.append) as left,
+        run_system(nodes(1), namespace=names[1], on_line=lines.append) as right,
+    ):
+        codes = [*run_to_the_end(left).values(), *run_to_the_end(right).values()]
+    assert codes == [0] * 8, lines
+    turned = []
+    for name in names:
+        with BagReader(tmp_path / name) as bag:
+            assert {topic for topic in bag.counts if not topic.startswith(f"/{name}/")} <= {"/diagnostics"}
+            poses = [recorded.message for recorded in bag.messages([f"/{name}/pose_6dof"])]
+        assert [pose.cycle for pose in poses] == list(range(1, cycles + 1))
+        assert {pose.status for pose in poses} == {Status.TRACKING}
+        turned.append(poses[-1].psi)
+    assert turned[0] != turned[1]  # two gears, not one heard twice
+
+
+def test_a_failing_node_ends_the_wait_and_the_others(tmp_path: Path) -> None:
+    lines: list[str] = []
+    nodes = chain(simulated(3, **SMALL_GEAR), calibration=str(tmp_path / "absent.yaml"))
+    with run_system(nodes, on_line=lines.append) as system:
+        ended = system.wait("frame_source", timeout=PATIENCE)
+        pids = [process.pid for process in system.processes.values()]
+    assert ended == {"localizer": 1}
+    assert any("absent.yaml" in line and line.startswith("[localizer] error:") for line in lines)
+    assert not any(map(alive, pids))
+
+
+def test_nodes_do_not_survive_a_killed_runner(tmp_path: Path) -> None:
+    script = tmp_path / "runner.py"
+    script.write_text(
+        "import json, time\n"
+        "from mems6dof_ros.nodes.system import NodeSpec, run_system\n"
+        "nodes = [NodeSpec('pose_estimator'), NodeSpec('recorder', {'autostart': False})]\n"
+        "with run_system(nodes) as system:\n"
+        "    print(json.dumps([p.pid for p in system.processes.values()]), flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    runner = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=_with_path()
+    )
+    assert runner.stdout is not None
+    pids = json.loads(runner.stdout.readline())
+    seen: list[str] = []
+    while not {"[pose_estimator] INFO ready", "[recorder] INFO stopped"} <= set(seen):
+        seen.append(runner.stdout.readline().rstrip())
+    assert all(map(alive, pids))
+    runner.send_signal(signal.SIGKILL)
+    runner.wait()
+    runner.stdout.close()
+    wait_until(lambda: not any(map(alive, pids)))
+
+
+def _with_path() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_tables_are_complete(name: str) -> None:
+    """Every argument is used, and every node waits for exactly those who listen to it."""
+    system = SYSTEMS[name]
+    table = system.table({"calibration": "c.yaml", "output": "out"})
+    by_name = {node.executable: node.parameters for node in table}
+    assert list(by_name) == ["frame_source", "localizer", "pose_estimator", "recorder"]
+    acknowledged = by_name["frame_source"].get("acknowledged_by")
+    assert by_name["localizer"]["wait_for_subscribers"] == ["localizations:2"]
+    assert by_name["pose_estimator"]["wait_for_subscribers"] == [
+        f"pose_6dof:{2 if acknowledged else 1}",
+        "pose:1",
+        "pose_with_covariance:1",
+    ]
+    assert by_name["frame_source"]["wait_for_subscribers"][:2] == ["image_raw:1", "frame_info:2"]
+    with pytest.raises(InputError, match="'bagg'"):
+        system.table({"bagg": "x"})
+
+
+def test_a_camera_driver_of_somebody_else() -> None:
+    table = SYSTEMS["live"].table({"source": "none", "image_topic": "/camera/image", "calibration": "c.yaml"})
+    assert [node.executable for node in table] == ["localizer", "pose_estimator"]
+    assert command(table[0])[4:6] == ["-r", "image_raw:=/camera/image"]

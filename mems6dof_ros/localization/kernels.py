@@ -16,7 +16,7 @@ weighting      number              UNIFORM, RELATIVE, LIGHT, POISSON
 kappa          number              RELATIVE only: variance floor over amplitude
 parameters     (n, 7)              out: x, y, A, sigma_x, sigma_y, rho, B of the image; px, electrons
 covariance     (n, 7, 7)           out
-quality        (n, 4)              out: reduced chi-square, iterations, lines cut off, saturated pixels
+quality        (n, 4)              out: reduced chi-square, iterations, lines cut off, 1 if saturated
 =============  ==================  =====================================================================
 
 Inside, a window is flat, each row padded to a multiple of LANES so that every loop runs in whole
@@ -125,8 +125,9 @@ def _weigh(
 ) -> float:
     """Second and first derivatives of the objective's half by the model: ``weights``, ``pulls``.
 
-    Returns the objective. Light-weighting differentiates the variance too where the model is the
-    greater: with it frozen, steps and acceptance test disagree and fits do not converge.
+    ``noise``: the weights themselves where they are fixed (UNIFORM, RELATIVE), else the variance of the
+    read noise. Returns the objective. Light-weighting differentiates the variance too where the model is
+    the greater: with it frozen, steps and acceptance test disagree and fits do not converge.
     """
     amplitude, background = theta[2], theta[6]
     total = 0.0

@@ -129,7 +129,8 @@ class MonitorServer:
             )
             return
         self._loop = asyncio.get_running_loop()
-        self._url.set_result(access.page_url(*runner.addresses[0][:2], self._token))
+        host, port, *_ = runner.addresses[0]
+        self._url.set_result(access.page_url(host, port, self._token))
         await self._stopping.wait()
         for page in list(self._pages):
             await page.close(code=1001, message=b"the monitor stops")

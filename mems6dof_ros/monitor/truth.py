@@ -12,24 +12,37 @@ from mems6dof_ros.pose.rigid import RigidPose
 
 
 class TruthAlignment:
-    """True displacements of one body, aligned to the measured pose of one cycle, ``cycle``.
+    """True displacements of one body within one version of the reference.
 
-    The measurement chose its own body frame, so truth compares only from some cycle on: there both are
-    equal by construction, and the error of the measurement in that cycle stays in all that follow. To
-    look at, therefore; ``mems6dof compare`` judges accuracy.
+    The measurement chose its own body frame, so truth compares only up to one fixed transform between both
+    frames. It is the mean over the first ``CYCLES`` pairs, so that its noise is small beside that of a
+    cycle; an error common to them stays hidden. To look at, therefore: a report judges accuracy.
     """
 
-    def __init__(self, pose: CyclePose, truth: GroundTruth) -> None:
-        self.cycle = pose.cycle
-        self.reference_version = pose.reference_version
-        measured = RigidPose(pose.rotation, pose.translation)
-        self._to_true_body = measured.then(RigidPose(truth.rotation, truth.translation).inverse())
-        self._reference = pose.translation - pose.displacement[:3]
-        self._psi_offset = pose.displacement[5] - truth.psi
+    CYCLES = 40
 
-    def displacement(self, truth: GroundTruth) -> NDArray[np.float64]:
-        """True displacement (6,) in the order of DEGREES_OF_FREEDOM, m and rad."""
-        true = self._to_true_body.then(RigidPose(truth.rotation, truth.translation))
-        tilt_x, tilt_y, psi = swing_twist(true.rotation)
-        psi = unwrap_near(psi, truth.psi + self._psi_offset)
-        return np.array([*(true.translation - self._reference), tilt_x, tilt_y, psi])
+    def __init__(self, reference_version: int) -> None:
+        self.reference_version = reference_version
+        self.cycles: list[int] = []
+        self._rotations = np.zeros((3, 3))
+        self._translations = np.zeros(3)
+
+    def add(self, pose: CyclePose, truth: GroundTruth) -> NDArray[np.float64] | None:
+        """True displacement (6,) of ``pose``, m and rad, in the order of DEGREES_OF_FREEDOM.
+
+        None until enough pairs have been added.
+        """
+        true = RigidPose(truth.rotation, truth.translation)
+        if len(self.cycles) < self.CYCLES:
+            between = RigidPose(pose.rotation, pose.translation).then(true.inverse())
+            self._rotations += between.rotation
+            self._translations += between.translation
+            self.cycles.append(pose.cycle)
+            return None
+        # The rotation nearest to the mean matrix (Moakher 2002, the mean in the Frobenius metric).
+        u, _, vt = np.linalg.svd(self._rotations)
+        own = RigidPose(u @ vt, self._translations / len(self.cycles)).then(true)
+        reference = pose.translation - pose.displacement[:3]
+        tilt_x, tilt_y, psi = swing_twist(own.rotation)
+        psi = unwrap_near(psi, pose.displacement[5])
+        return np.array([*(own.translation - reference), tilt_x, tilt_y, psi])

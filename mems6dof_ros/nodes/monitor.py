@@ -34,6 +34,7 @@ from mems6dof_ros.monitor.truth import TruthAlignment
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter
+from mems6dof_ros.nodes.snapshots import Snapshots
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
 
@@ -105,7 +106,6 @@ class MonitorNode(InstrumentNode):
         self._poses: _Recent[int, list[CyclePose]] = _Recent()
         self._found: _Recent[int, bytes] = _Recent()
         self._infos: _Recent[int, FrameInfo] = _Recent()
-        self._image: Any = None  # the subscription, while an image is waited for
         self._images: Queue[bytes | None] = Queue(maxsize=1)
         self._painter = threading.Thread(target=self._paint, name="painter", daemon=True)
 
@@ -124,7 +124,7 @@ class MonitorNode(InstrumentNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_STATE_PERIOD, self._tell_state, clock=steady)
         if rate := self.values["picture_rate"]:
-            self.create_timer(1 / rate, self._ask_for_image, clock=steady)
+            Snapshots(self, topics.IMAGE, rate, self._wants_image, self._images.put)
 
         self._painter.start()
         self.tell(f"live page: {self._server.start()}")
@@ -185,8 +185,8 @@ class MonitorNode(InstrumentNode):
             return None
         alignment = self._alignments.get(pose.body)
         if alignment is None or alignment.reference_version != pose.reference_version:
-            alignment = self._alignments[pose.body] = TruthAlignment(pose, truth)
-        return alignment.displacement(truth)
+            alignment = self._alignments[pose.body] = TruthAlignment(pose.reference_version)
+        return alignment.add(pose, truth)
 
     def _tell_state(self) -> None:
         now = time.monotonic()
@@ -198,7 +198,10 @@ class MonitorNode(InstrumentNode):
                 "rates": {name: round(rate, 1) for name, rate in rates.items()},
                 "stale": round(now - self._newest_at, 1) if self._newest else None,
                 "frames_dropped": self._frames_dropped,
-                "aligned_at": {body: alignment.cycle for body, alignment in self._alignments.items()},
+                "aligned": {
+                    body: [alignment.cycles[0], alignment.cycles[-1]]
+                    for body, alignment in self._alignments.items()
+                },
                 "services": {name: client.service_is_ready() for name, client in self._triggers.items()},
                 "diagnostics": list(self._diagnostics.values()),
             }
@@ -206,25 +209,10 @@ class MonitorNode(InstrumentNode):
 
     # Pictures -----------------------------------------------------------------------------------
 
-    def _ask_for_image(self) -> None:
-        """Subscribe to images until the next one has come.
-
-        A standing subscription would carry every frame across DDS once more, which takes a good part
-        of a processor at 90 frames/s and slows the measurement; one that lives for one frame does not.
-        Nor must it be taken for the localizer by a source that waits for somebody to listen, hence
-        nothing happens before frames flow.
-        """
+    def _wants_image(self) -> bool:
+        """Only while frames flow: a source must not take the monitor for the localizer that it waits for."""
         flowing = time.monotonic() - self._heard_at < _STANDSTILL
-        if flowing and self._feed.watchers and self._image is None and self._images.empty():
-            self._image = self.create_subscription(
-                Image, topics.IMAGE, self._on_image, transport.FRAMES, raw=True
-            )
-
-    def _on_image(self, data: bytes) -> None:
-        if self._image is not None:
-            self.destroy_subscription(self._image)
-            self._image = None
-            self._images.put(data)
+        return flowing and self._feed.watchers > 0 and self._images.empty()
 
     def _paint(self) -> None:
         """Make pictures, in a thread of its own, until None comes; without images, of points only."""

@@ -57,9 +57,15 @@ def serve() -> Iterator[Callable[..., Served]]:
 
 
 class Instrument:
-    """Monitor node and synthetic gear as processes, in a ROS domain of their own."""
+    """A node that watches, by default the monitor, and the synthetic gear; in a ROS domain of their own."""
 
-    def __init__(self, *monitor_args: str, machine_args: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        *monitor_args: str,
+        machine_args: tuple[str, ...] = (),
+        module: str = "mems6dof_ros.nodes.monitor",
+        says: str = "live page: ",
+    ) -> None:
         domain = 10 + os.getpid() % 90
         self._environment = os.environ | {
             "PYTHONPATH": str(ROOT),
@@ -69,7 +75,8 @@ class Instrument:
             "PYTHONUNBUFFERED": "1",
         }
         self.lines: list[str] = []
-        self.monitor = self._start("-m", "mems6dof_ros.nodes.monitor", "--ros-args", *monitor_args)
+        self._says = says
+        self.monitor = self._start("-m", module, "--ros-args", *monitor_args)
         self.machine = self._start(str(HERE / "synthetic.py"), *machine_args)
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -94,14 +101,15 @@ class Instrument:
         deadline = time.monotonic() + 20
         while time.monotonic() < deadline and self.monitor.poll() is None:
             for line in list(self.lines):
-                if "live page: " in line:
-                    return line.partition("live page: ")[2]
+                if self._says in line:
+                    return line.partition(self._says)[2]
             time.sleep(0.02)
         raise AssertionError("\n".join(self.lines))
 
     def stop(self) -> int:
         """End both; returns the exit status of the monitor."""
-        self.machine.terminate()
+        if self.machine.poll() is None:
+            self.machine.terminate()
         self.machine.wait(10)
         if self.monitor.poll() is None:
             self.monitor.send_signal(signal.SIGINT)

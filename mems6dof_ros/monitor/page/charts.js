@@ -178,9 +178,9 @@ export class CycleChart {
     });
     this.readOut();
     if (this.legend) {
-      const aligned = this.view.alignedAt;
+      const { aligned } = this.view;
       const text = `against motion cycle, band ±${BAND_SD} sd`
-        + (aligned === undefined ? "" : `; broad grey line: simulator's truth, aligned at cycle ${aligned}`);
+        + (aligned ? `; broad grey line: simulator's truth, aligned over cycles ${aligned.join(" to ")}` : "");
       if (this.legend.textContent !== text) this.legend.textContent = text;
     }
   }

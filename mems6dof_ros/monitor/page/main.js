@@ -47,7 +47,7 @@ const link = new Link({
     state = message;
     const changed = (key) => JSON.stringify(before?.[key]) !== JSON.stringify(state[key]);
     showStatus(open, state, body);
-    view.alignedAt = state.aligned_at?.[bodyName()];
+    view.aligned = state.aligned?.[bodyName()];
     if (changed("bodies")) showBodies();
     if (changed("limits")) {
       view.limits = new Map(state.limits.map((limit) => [limit.quantity, limit]));

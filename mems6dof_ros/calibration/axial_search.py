@@ -19,11 +19,19 @@ _REFINEMENTS = 8
 
 @njit(cache=True, nogil=True)
 def search_defocus(
-    measured: Array, noise: Array, local: Array, grid: Array, basis: Array, slope_basis: Array, scatter: Array
+    measured: Array,
+    noise: Array,
+    local: Array,
+    limits: NDArray[np.int64],
+    grid: Array,
+    basis: Array,
+    slope_basis: Array,
+    scatter: Array,
 ) -> tuple[Array, Array, Array]:
     """Best and second-best defocus of n particles from k features.
 
     ``measured`` (n, k), ``noise`` (n, k, k); ``local`` (n, k, m): coefficients of each particle's curves;
+    ``limits`` (n, 2): first and last grid point to consider;
     ``grid`` (g,) m, equidistant, with ``basis`` and ``slope_basis`` (g, m): the polynomials there and
     their derivatives per grid step; ``scatter`` (g, k, k). Between grid points basis and scatter are
     interpolated (cubic Hermite, linear).
@@ -42,7 +50,8 @@ def search_defocus(
     tangent = np.empty(k)
     factor = np.empty((k, k))
     for i in range(count):
-        for g in range(points):
+        first, last = limits[i]
+        for g in range(first, last + 1):
             for a in range(k):
                 value = 0.0
                 derivative = 0.0
@@ -57,15 +66,15 @@ def search_defocus(
             log_det = _factorize(factor, k)
             chi, _, _ = _products(factor, residual, tangent, k)
             level[g] = chi + log_det
-        for g in range(points):
-            if (g > 0 and level[g] >= level[g - 1]) or (g < points - 1 and level[g] > level[g + 1]):
+        for g in range(first, last + 1):
+            if (g > first and level[g] >= level[g - 1]) or (g < last and level[g] > level[g + 1]):
                 continue
-            low, high = max(g - 1.0, 0.0), min(g + 1.0, points - 1.0)
+            low, high = max(g - 1.0, float(first)), min(g + 1.0, float(last))
             at = float(g)
             chi = 0.0
             log_det = 0.0
             for iteration in range(_REFINEMENTS + 1):
-                left = min(int(at), points - 2)
+                left = min(int(at), last - 1)
                 t = at - left
                 for a in range(k):
                     y0, y1, d0, d1 = curve[left, a], curve[left + 1, a], slope[left, a], slope[left + 1, a]

@@ -27,8 +27,9 @@ FEW_BEADS = 10
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """``axial_range`` m: largest |defocus| to model (all that the stacks cover). ``orders``: instead of
-    choosing them by cross-validation. ``rotations`` rad: the substrate's orientation in each stack."""
+    """``axial_range`` m: largest |defocus| to declare valid (default: all that the stacks cover); stacks that
+    reach 2 um further let particles beyond it be recognised. ``orders``: instead of choosing them by
+    cross-validation. ``rotations`` rad: the substrate's orientation in each stack."""
 
     axial_range: float | None = None
     orders: Orders | None = None
@@ -70,7 +71,7 @@ def calibrate(
     while True:
         reference = reference_map([bead for _, bead in beads], radius, first.pixel_size, first.image_size)
         curves = [_curve(bead, index, reference, first) for index, bead in beads]
-        interval = _interval(curves, settings.axial_range)
+        interval = _interval(curves)
         fit = fit_model(curves, reference, interval, settings.orders, settings.rotations, progress)
         departure = _departures(fit)
         outliers = departure > OUTLIER
@@ -92,7 +93,7 @@ def calibrate(
         first.weighting,
         first.window_px,
         first.camera,
-        _valid_range(chosen, curves, interval, first),
+        _valid_range(chosen, curves, interval, first, settings.axial_range),
         provenance=_provenance(stacks, settings, fit, len(beads), len(rejected)),
     )
     warnings = _warnings(len(beads), fit)
@@ -120,12 +121,12 @@ def _check_alike(stacks: Sequence[FocusStack], settings: CalibrationSettings) ->
 
 def _curve(bead: BeadStack, stack: int, reference: FieldMap, first: FocusStack) -> BeadCurve:
     x, y = field_position(bead.fits.parameters, first.pixel_size, first.image_size)
-    values, noise = features(bead.fits, first.pixel_size, reference(x, y))
+    values, noise = features(bead.fits, bead.moments, first.pixel_size, reference(x, y))
     values[:, 0], values[:, 1] = x, y
     return BeadCurve(x[bead.in_focus], y[bead.in_focus], bead.stage_z, values, noise, stack)
 
 
-def _interval(curves: Sequence[BeadCurve], limit: float | None) -> tuple[float, float]:
+def _interval(curves: Sequence[BeadCurve]) -> tuple[float, float]:
     """Defocus that at least 80 % of the beads cover, on either side."""
     low, high = [], []
     for curve in curves:
@@ -133,8 +134,6 @@ def _interval(curves: Sequence[BeadCurve], limit: float | None) -> tuple[float, 
         low.append(u.min())
         high.append(u.max())
     interval = (float(np.quantile(low, 0.8)), float(np.quantile(high, 0.2)))
-    if limit is not None:
-        interval = (max(interval[0], -limit), min(interval[1], limit))
     if not interval[0] < 0 < interval[1]:
         raise InputError("focus stacks", "beads in focus only at the ends", "planes on both sides of focus")
     return interval
@@ -148,7 +147,11 @@ def _departures(fit: ModelFit) -> Array:
 
 
 def _valid_range(
-    beads: Sequence[BeadStack], curves: Sequence[BeadCurve], interval: tuple[float, float], first: FocusStack
+    beads: Sequence[BeadStack],
+    curves: Sequence[BeadCurve],
+    interval: tuple[float, float],
+    first: FocusStack,
+    limit: float | None,
 ) -> ValidRange:
     """Half a bead distance beyond the outermost beads, inside the image; the whole image for few beads."""
     half = [(n - 1) / 2 * first.pixel_size for n in first.image_size]
@@ -160,6 +163,8 @@ def _valid_range(
         )
     )
     flux = [bead.flux for bead in beads]
+    if limit is not None:
+        interval = (max(interval[0], -limit), min(interval[1], limit))
     return ValidRange(interval, x, y, (min(flux) / BRIGHTNESS_FACTOR, max(flux) * BRIGHTNESS_FACTOR))
 
 

@@ -1,6 +1,7 @@
 """From fitted shapes to positions: the two methods differ only in the features they read.
 
-``rho_amp``, the paper's route, reads its one feature; ``joint`` reads both widths and the correlation.
+``rho_amp``, the paper's route, reads its one feature; ``joint`` reads both widths, the correlation and the
+moments of the residual image; without an image at hand, the shape of the fits alone.
 Both look up the same forward model with the same search, so an ambiguous or insensitive place of the
 field shows itself in the same way.
 
@@ -10,6 +11,8 @@ real particles about the model is common to x, y and z: every position has its f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
@@ -18,14 +21,13 @@ from scipy.stats import chi2
 from mems6dof_ros.calibration.axial_search import search_defocus
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.interface import Positions
+from mems6dof_ros.calibration.moments import MOMENTS, Moments
 from mems6dof_ros.calibration.optical_model import FEATURES, OpticalModel, features, field_position
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
-#: Features that each method reads, as indices into FEATURES.
-METHODS = {
-    "rho_amp": (FEATURES.index("rho_amp"),),
-    "joint": tuple(FEATURES.index(name) for name in ("ln_sigma_x", "ln_sigma_y", "atanh_rho")),
-}
+#: Features that each method reads.
+SHAPE = ("ln_sigma_x", "ln_sigma_y", "atanh_rho")
+METHODS = {"rho_amp": ("rho_amp",), "joint": (*SHAPE, *MOMENTS)}
 
 #: A second z is a candidate while its L is worse by less than this: 4 sigma of a likelihood ratio.
 AMBIGUITY_GAP = 16.0
@@ -34,22 +36,25 @@ MISFIT_PROBABILITY = 1e-5
 #: Sensitivity dz/dq is lost where z would have an uncertainty beyond this part of the range.
 BLIND_FRACTION = 0.25
 
-_GRID_STEP = 100e-9
+#: A single feature is of use where its scatter stands for less than this error of z, m.
+_USELESS = 0.25e-6
+
+_GRID_STEP = 125e-9
 
 
 class Estimator:
-    """Positions of fitted particles from ``model`` by ``method``, valid for defocus in ``z_range`` (m)."""
+    """Positions of fitted particles from the features ``used`` of ``model``, for defocus in ``z_range`` m."""
 
     def __init__(
         self,
         model: OpticalModel,
-        method: str,
+        used: Sequence[str],
         z_range: tuple[float, float],
         pixel_size: float,
         image_size: tuple[int, int],
     ) -> None:
         self._model = model
-        self._used = np.array(METHODS[method])
+        self._used = np.array([FEATURES.index(name) for name in used])
         self._z_range = z_range
         self._pixel_size = pixel_size
         self._image_size = image_size
@@ -66,9 +71,9 @@ class Estimator:
         self._scatter = np.ascontiguousarray(
             model.scatter_at(self._grid)[:, self._used[:, None], self._used[None, :]]
         )
-        self._misfit = chi2.isf(MISFIT_PROBABILITY, max(len(self._used) - 1, 1))
+        self._misfit = chi2.isf(MISFIT_PROBABILITY, max(len(used) - 1, 1))
 
-    def locate(self, fits: GaussianFits) -> Positions:
+    def locate(self, fits: GaussianFits, moments: Moments | None = None) -> Positions:
         """Positions of ``fits`` (n); see :class:`~mems6dof_ros.calibration.interface.Positions`."""
         count = len(fits)
         position = np.full((count, 3), np.nan)
@@ -84,19 +89,25 @@ class Estimator:
                 fits.iterations[usable],
                 fits.flags[usable],
             )
-            position[usable], covariance[usable], z_gap[usable], flags[usable] = self._locate(chosen)
+            position[usable], covariance[usable], z_gap[usable], flags[usable] = self._locate(
+                chosen, None if moments is None else moments[usable]
+            )
         return Positions(position, covariance, z_gap, flags)
 
-    def _locate(self, fits: GaussianFits) -> tuple[Array, Array, Array, NDArray[np.uint32]]:
+    def _locate(
+        self, fits: GaussianFits, moments: Moments | None
+    ) -> tuple[Array, Array, Array, NDArray[np.uint32]]:
         model, used = self._model, self._used
         x, y = field_position(fits.parameters, self._pixel_size, self._image_size)
-        measured, noise = features(fits, self._pixel_size, model.reference(x, y))
+        measured, noise = features(fits, moments, self._pixel_size, model.reference(x, y))
         measured[:, 0], measured[:, 1] = x, y
         local = model.curves.local(x, y)
+        limits = self._limits(local)
         defocus, objective, chi_square = search_defocus(
             measured[:, used],
             noise[:, used[:, None], used[None, :]],
             local[:, used],
+            limits,
             self._grid,
             self._basis,
             self._slope_basis,
@@ -111,7 +122,8 @@ class Estimator:
         low, high = self._z_range
         ambiguous = z_gap < AMBIGUITY_GAP
         blind = ~(sd_u < BLIND_FRACTION * (high - low))
-        beyond = (best < low) | (best > high)
+        first, last = self._grid[limits].T
+        beyond = (best < np.maximum(low, first + sd_u)) | (best > np.minimum(high, last - sd_u))
         flags = np.where(ambiguous, Flag.Z_AMBIGUOUS, 0) | np.where(beyond, Flag.Z_OUT_OF_RANGE, 0)
         flags |= np.where(chi_square[:, 0] > self._misfit, Flag.POOR_FIT, 0) | np.where(blind, Flag.NO_Z, 0)
         covariance[ambiguous] = self._mixture(
@@ -121,6 +133,23 @@ class Estimator:
             z_gap[ambiguous],
         )
         return position, covariance, z_gap, flags.astype(np.uint32)
+
+    def _limits(self, local: Array) -> NDArray[np.int64]:
+        """First and last grid point (n, 2) to consider: for a single feature the monotonic part of its curve
+        through focus, as far as its scatter leaves it useful; one number cannot tell branches apart."""
+        count = len(local)
+        points = len(self._grid)
+        if len(self._used) > 1:
+            return np.tile(np.array([0, points - 1]), (count, 1))
+        slope = local[:, self._used[0]] @ self._slope_basis.T / (self._grid[1] - self._grid[0])
+        middle = int(np.argmin(np.abs(self._grid)))
+        turns = slope * np.sign(slope[:, middle : middle + 1]) <= np.sqrt(self._scatter[:, 0, 0]) / _USELESS
+        right = np.where(turns[:, middle:].any(axis=1), np.argmax(turns[:, middle:], axis=1), points - middle)
+        left = np.where(turns[:, middle::-1].any(axis=1), np.argmax(turns[:, middle::-1], axis=1), middle + 1)
+        # A curve that turns in focus itself leaves no branch: the particle is flagged as out of range.
+        return np.stack(
+            [np.minimum(middle - left + 1, middle), np.maximum(middle + right - 1, middle + 1)], axis=1
+        )
 
     def _corrected(
         self, measured: Array, noise: Array, local: Array, u: Array, focus: Array

@@ -21,9 +21,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from mems6dof_ros.calibration.estimator import METHODS, Estimator
+from mems6dof_ros.calibration.estimator import METHODS, SHAPE, Estimator
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
 from mems6dof_ros.calibration.interface import Positions
+from mems6dof_ros.calibration.moments import residual_moments
 from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
@@ -33,6 +34,8 @@ from mems6dof_ros.localization.localizations import Flag, GaussianFits
 FORMAT = "mems6dof-calibration"
 VERSION = 1
 DEFAULT_METHOD = "joint"
+#: Standard deviations by which two estimates of z differ if they are on different branches.
+BRANCHES_APART = 5.0
 
 
 @dataclass(frozen=True)
@@ -73,13 +76,30 @@ class Calibration:
         text = json.dumps(_content(self), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    @cached_property
-    def _estimator(self) -> Estimator:
-        return Estimator(self.model, self.method, self.valid.z, self.pixel_size, self.image_size)
+    def _estimator(self, names: tuple[str, ...]) -> Estimator:
+        return Estimator(self.model, names, self.valid.z, self.pixel_size, self.image_size)
 
-    def locate(self, fits: GaussianFits) -> Positions:
-        """Positions of ``fits``; failed fits give NaN, values beyond the valid range are flagged."""
-        found = self._estimator.locate(fits)
+    @cached_property
+    def _by_method(self) -> Estimator:
+        return self._estimator(METHODS[self.method])
+
+    @cached_property
+    def _by_shape(self) -> Estimator:
+        return self._estimator(SHAPE)
+
+    def locate(self, fits: GaussianFits, image: NDArray[np.generic] | None = None) -> Positions:
+        """Positions of ``fits``; failed fits give NaN, values beyond the valid range are flagged.
+
+        ``image`` (height, width) ADU, in which they were fitted: method joint reads from it what the
+        Gaussians leave over, and is less precise without.
+        """
+        if self.method == "rho_amp":
+            found = _guarded(self._by_method.locate(fits), self._by_shape.locate(fits))
+        elif image is None:
+            found = self._by_shape.locate(fits)
+        else:
+            moments = residual_moments(image, fits, self.camera, self.window_px)
+            found = self._by_method.locate(fits, moments)
         x, y = field_position(fits.parameters, self.pixel_size, self.image_size)
         with np.errstate(invalid="ignore"):
             outside = _outside(x, self.valid.x) | _outside(y, self.valid.y)
@@ -90,6 +110,16 @@ class Calibration:
     def with_method(self, method: str) -> Calibration:
         """The same calibration read by another ``method``; InputError for an unknown one."""
         return replace(self, method=method)
+
+
+def _guarded(found: Positions, shape: Positions) -> Positions:
+    """Flag as ambiguous what the ``shape`` places on another branch: one feature alone cannot tell."""
+    difference = np.abs(found.position[:, 2] - shape.position[:, 2])
+    variance = found.covariance[:, 2, 2] + shape.covariance[:, 2, 2]
+    with np.errstate(invalid="ignore"):
+        apart = difference > BRANCHES_APART * np.sqrt(variance)
+    elsewhere = np.where(apart, Flag.Z_AMBIGUOUS, 0) | (shape.flags & Flag.Z_OUT_OF_RANGE)
+    return replace(found, flags=found.flags | elsewhere.astype(np.uint32))
 
 
 def _outside(value: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:

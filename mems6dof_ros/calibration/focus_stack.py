@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.moments import Moments, residual_moments
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
@@ -34,10 +35,11 @@ _SEED_PLANES = 7
 
 @dataclass(frozen=True)
 class BeadStack:
-    """One bead through focus: ``stage_z`` (n,) m in the order of the planes, with its ``fits`` (n)."""
+    """One bead through focus: ``stage_z`` (n,) m in the order of the planes, its ``fits`` and ``moments``."""
 
     stage_z: Array
     fits: GaussianFits
+    moments: Moments
 
     @property
     def in_focus(self) -> int:
@@ -97,7 +99,8 @@ def measure_stack(
     stage_z, pixel_size, image_size = _check_planes(planes, description or "focus stack")
     seeds = _find_beads(planes, window_px)
     fits = _track(planes, seeds, camera, weighting, window_px, progress)
-    beads, rejected = _select(fits, seeds, stage_z, window_px)
+    moments = [residual_moments(p.image, f, camera, window_px) for p, f in zip(planes, fits, strict=True)]
+    beads, rejected = _select(fits, moments, seeds, stage_z, window_px)
     return FocusStack(
         beads,
         rejected,
@@ -191,7 +194,11 @@ def _track(
 
 
 def _select(
-    fits: Sequence[GaussianFits], seeds: Array, stage_z: Array, window_px: int
+    fits: Sequence[GaussianFits],
+    moments: Sequence[Moments],
+    seeds: Array,
+    stage_z: Array,
+    window_px: int,
 ) -> tuple[tuple[BeadStack, ...], tuple[Rejection, ...]]:
     parameters = np.array([found.parameters for found in fits])
     flags = np.array([found.flags for found in fits])
@@ -211,7 +218,7 @@ def _select(
         elif (flags[used, number] & Flag.SATURATED).any():
             reason = f"saturated in {np.count_nonzero(flags[used, number] & Flag.SATURATED)} planes"
         else:
-            bead = _bead(fits, used, number, stage_z)
+            bead = _bead(fits, moments, used, number, stage_z)
             if 1 < bead.in_focus < len(used) - 2:
                 beads.append(bead)
                 places.append(seed)
@@ -247,7 +254,13 @@ def _run_through_focus(parameters: Array, good: NDArray[np.bool_]) -> NDArray[np
     return np.arange(first, last)
 
 
-def _bead(fits: Sequence[GaussianFits], used: NDArray[np.intp], number: int, stage_z: Array) -> BeadStack:
+def _bead(
+    fits: Sequence[GaussianFits],
+    moments: Sequence[Moments],
+    used: NDArray[np.intp],
+    number: int,
+    stage_z: Array,
+) -> BeadStack:
     chosen = [fits[index] for index in used]
     return BeadStack(
         stage_z[used],
@@ -257,5 +270,9 @@ def _bead(fits: Sequence[GaussianFits], used: NDArray[np.intp], number: int, sta
             np.array([f.chi_square[number] for f in chosen]),
             np.array([f.iterations[number] for f in chosen]),
             np.array([f.flags[number] for f in chosen]),
+        ),
+        Moments(
+            np.array([moments[index].values[number] for index in used]),
+            np.array([moments[index].covariance[number] for index in used]),
         ),
     )

@@ -40,6 +40,9 @@ class OpticalCalibration(Protocol):
     weighting: str
     window_px: int
 
-    def locate(self, fits: GaussianFits) -> Positions:
-        """Positions of ``fits``; failed fits give NaN, values beyond the range are flagged."""
+    def locate(self, fits: GaussianFits, image: NDArray[np.generic] | None = None) -> Positions:
+        """Positions of ``fits``; failed fits give NaN, values beyond the range are flagged.
+
+        ``image`` (height, width) ADU, in which they were fitted, for methods that read more of it.
+        """
         ...

@@ -22,7 +22,7 @@ from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalMo
 from mems6dof_ros.calibration.zernike import zernike, zernike_count
 
 #: Groups of features that may need different orders, as slices of FEATURES.
-GROUPS = {"lateral": slice(0, 2), "shape": slice(2, 5), "rho_amp": slice(5, 6)}
+GROUPS = {"lateral": slice(0, 2), "shape": slice(2, 5), "rho_amp": slice(5, 6), "moments": slice(6, 11)}
 #: Orders that cross-validation chooses from.
 FIELD_ORDERS = (0, 1, 2, 3, 4, 5)
 DEGREES = (6, 8, 10, 12, 14, 16)
@@ -34,7 +34,7 @@ _ROUNDS = 3
 #: Of orders whose scores agree within this factor the fewest coefficients are taken.
 _AS_GOOD = 1.01
 #: Scatter assumed before it is known, as standard deviations of FEATURES: of the order of real beads'.
-_FIRST_SCATTER = np.diag(np.array([5e-9, 5e-9, 0.02, 0.02, 0.02, 0.02]) ** 2)
+_FIRST_SCATTER = np.diag(np.array([5e-9, 5e-9, *[0.02] * 4, *[5e-4] * 5]) ** 2)
 
 
 @dataclass(frozen=True)

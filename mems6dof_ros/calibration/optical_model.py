@@ -1,9 +1,10 @@
 """The forward model of the optics: what the Gaussian fit sees of a particle at (X, Y, z).
 
-Six features of every fitted image, in the order of FEATURES: the apparent lateral motion ``dx``, ``dy``
-(m), the shape ``ln sigma_x``, ``ln sigma_y`` (of px), ``atanh rho``, and the paper's ``rho_amp``. None of
-them changes with brightness. The model knows how they vary with defocus u and over the field, and how
-much real particles scatter about it, because local aberrations and diameters differ.
+Features of every fitted image, in the order of FEATURES: the apparent lateral motion ``dx``, ``dy`` (m), the
+shape ``ln sigma_x``, ``ln sigma_y`` (of px), ``atanh rho``, the paper's ``rho_amp``, and the moments of what
+the Gaussian leaves over. None of them changes with brightness. The model knows how they vary with defocus
+u and over the field, and how much real particles scatter about it, because local aberrations and
+diameters differ.
 
 Heights split as z = u + f(X, Y): u is the distance to the local focus (sharpest image), and the focus
 surface f holds field curvature and tilt, zero on the axis.
@@ -16,11 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
+from mems6dof_ros.calibration.moments import MOMENTS, Moments
 from mems6dof_ros.calibration.zernike import zernike, zernike_order
 from mems6dof_ros.localization.localizations import GaussianFits
 
 #: Order of the features everywhere in this room.
-FEATURES = ("dx", "dy", "ln_sigma_x", "ln_sigma_y", "atanh_rho", "rho_amp")
+FEATURES = ("dx", "dy", "ln_sigma_x", "ln_sigma_y", "atanh_rho", "rho_amp", *MOMENTS)
+_FITTED = len(FEATURES) - len(MOMENTS)
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class OpticalModel:
     """``curves`` of the FEATURES over defocus u (m) and field; ``focus`` f(X, Y) in m; ``reference``, the
     natural logarithm of the amplitude at rho* over the flux (px^-2), for rho_amp.
 
-    ``nodes`` (g,) m: defocus at which ``scatter`` (g, 6, 6) gives the covariance of the particles'
+    ``nodes`` (g,) m: defocus at which ``scatter`` (g, k, k) gives the covariance of the particles'
     features about the model, fit noise excluded. ``focus_variance`` m^2: of the focus surface.
     """
 
@@ -53,7 +56,7 @@ class OpticalModel:
     focus_variance: float
 
     def scatter_at(self, u: Array) -> Array:
-        """``scatter`` interpolated linearly at defocus ``u`` (n,): (n, 6, 6)."""
+        """``scatter`` interpolated linearly at defocus ``u`` (n,): (n, k, k)."""
         position = np.clip((u - self.nodes[0]) / (self.nodes[1] - self.nodes[0]), 0, len(self.nodes) - 1)
         left = np.minimum(position.astype(np.intp), len(self.nodes) - 2)
         weight = (position - left)[:, None, None]
@@ -69,8 +72,11 @@ def field_position(parameters: Array, pixel_size: float, image_size: tuple[int, 
     )
 
 
-def features(fits: GaussianFits, pixel_size: float, log_reference: Array) -> tuple[Array, Array]:
-    """FEATURES (n, 6) and their covariance (n, 6, 6) from ``fits``.
+def features(
+    fits: GaussianFits, moments: Moments | None, pixel_size: float, log_reference: Array
+) -> tuple[Array, Array]:
+    """FEATURES (n, k) and their covariance (n, k, k) from ``fits``; NaN for the moments without them.
+
 
     dx and dy are here the fitted positions in m (of px 0). ``log_reference`` (n,): ln of the reference
     amplitude over flux, in px^-2; with A = flux / (2 pi sigma_x sigma_y sqrt(1 - rho^2)) the paper's
@@ -80,10 +86,11 @@ def features(fits: GaussianFits, pixel_size: float, log_reference: Array) -> tup
     complement = 1 - rho**2
     scale = 2 * np.pi * np.exp(log_reference) * sigma_x * sigma_y
     rho_amp = scale * rho * np.sqrt(complement)
-    values = np.stack(
+    values = np.full((len(fits), len(FEATURES)), np.nan)
+    values[:, :_FITTED] = np.stack(
         [x * pixel_size, y * pixel_size, np.log(sigma_x), np.log(sigma_y), np.arctanh(rho), rho_amp], axis=1
     )
-    jacobian = np.zeros((len(fits), 6, 7))
+    jacobian = np.zeros((len(fits), _FITTED, 7))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = pixel_size
     jacobian[:, 2, 3] = 1 / sigma_x
     jacobian[:, 3, 4] = 1 / sigma_y
@@ -91,4 +98,10 @@ def features(fits: GaussianFits, pixel_size: float, log_reference: Array) -> tup
     jacobian[:, 5, 3] = rho_amp / sigma_x
     jacobian[:, 5, 4] = rho_amp / sigma_y
     jacobian[:, 5, 5] = scale * (1 - 2 * rho**2) / np.sqrt(complement)
-    return values, jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
+    covariance = np.zeros((len(fits), len(FEATURES), len(FEATURES)))
+    covariance[:, :_FITTED, :_FITTED] = jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
+    if moments is not None:
+        # The residual of a well-weighted fit is all but uncorrelated with its parameters.
+        values[:, _FITTED:] = moments.values
+        covariance[:, _FITTED:, _FITTED:] = moments.covariance
+    return values, covariance

@@ -43,9 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--window", type=int, default=WINDOW_PX, help="side of the window, px (default: %(default)s)"
     )
     fit.add_argument("--weighting", default=WEIGHTING, help="weighting of the fit (default: %(default)s)")
-    fit.add_argument(
-        "--axial-range", type=float, help="largest |defocus| to model, m (default: all there is)"
-    )
+    fit.add_argument("--axial-range", type=float, help="largest |defocus| to declare valid, m")
     fit.add_argument("--method", help="method that the file proposes (default: the best by measurement)")
     parser.set_defaults(run=run)
 

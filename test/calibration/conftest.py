@@ -34,7 +34,7 @@ class Held:
 
     @property
     def z_error(self) -> np.ndarray:
-        """z errors (m) of unflagged particles; the stack's origin and the substrate's tilt are conventions."""
+        """z errors (m) of unflagged particles; the origin and the substrate's tilt are conventions."""
         good = self.good
         design = np.column_stack([np.ones(good.sum()), self.position[good, :2]])
         error = (self.found.position - self.position)[good, 2]
@@ -70,7 +70,7 @@ def measure(
         inside = ((px > margin) & (px < np.array(settings.image_size) - 1 - margin)).all(axis=1)
         fits = fit_gaussians(frame.image, px[inside], calibration.camera, WEIGHTING, WINDOW_PX)
         positions.append(truth[inside])
-        found.append(calibration.locate(fits))
+        found.append(calibration.locate(fits, frame.image))
     return Held(
         np.concatenate(positions),
         Positions(*(np.concatenate([getattr(f, name) for f in found]) for name in _FIELDS)),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -25,45 +25,14 @@ from mems6dof_ros import __version__
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording.definitions import definition, typestore
 from mems6dof_ros.recording.messages import Message, serialize
+from mems6dof_ros.recording.metadata import Channel, FileSummary, Qos, metadata_text, write_metadata
+
+__all__ = ["BagReader", "BagWriter", "Channel", "Qos", "Recorded"]
 
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 #: Name of the MCAP metadata record with our provenance.
 PROVENANCE = "mems6dof"
-
-_METADATA_VERSION = 9  # of rosbag2 in Jazzy; Humble reads up to 8 but takes the MCAP file alone
-INFINITE_NS = 2**63 - 1  # rmw's "unspecified" duration, as rosbag2 writes it
-
-
-@dataclass(frozen=True)
-class Qos:
-    """Quality of service offered by a publisher, in rosbag2's words; durations in ns."""
-
-    history: str = "keep_last"
-    depth: int = 10
-    reliability: str = "reliable"
-    durability: str = "volatile"
-    deadline: int = INFINITE_NS
-    lifespan: int = INFINITE_NS
-    liveliness: str = "automatic"
-    liveliness_lease_duration: int = INFINITE_NS
-    avoid_ros_namespace_conventions: bool = False
-
-    def profile(self) -> dict[str, Any]:
-        """As plain data for metadata.yaml."""
-        plain = asdict(self)
-        for name in ("deadline", "lifespan", "liveliness_lease_duration"):
-            seconds, nanoseconds = divmod(plain[name], 10**9)
-            plain[name] = {"sec": seconds, "nsec": nanoseconds}
-        return plain
-
-
-class Channel(NamedTuple):
-    """A topic of a bag: ``add_channel`` returns it, ``write`` takes it."""
-
-    topic: str
-    type: str
-    qos: tuple[Qos, ...]
 
 
 class BagWriter:
@@ -167,10 +136,7 @@ class BagWriter:
         return sum(file.message_count for file in self._files)
 
     def _write_metadata(self) -> None:
-        text = _metadata_yaml(self._files, self._channels, self.provenance)
-        temporary = self.path / "metadata.yaml.part"
-        temporary.write_text(text)
-        temporary.replace(self.path / "metadata.yaml")
+        write_metadata(self.path, [file.summary() for file in self._files], self.provenance)
 
 
 class _File:
@@ -198,6 +164,10 @@ class _File:
     @property
     def size(self) -> int:
         return self._stream.tell() if not self._stream.closed else self.path.stat().st_size
+
+    def summary(self) -> FileSummary:
+        hashes = {channel.type: definition(channel.type).type_hash for channel in self.counts}
+        return FileSummary(self.path.name, self.start_ns, self.end_ns, dict(self.counts), hashes)
 
     def add_channel(self, channel: Channel) -> None:
         described = definition(channel.type)
@@ -231,59 +201,12 @@ class _File:
     def close(self) -> None:
         if self._stream.closed:
             return
-        text = _metadata_yaml([self], list(self.counts), self._provenance)
+        text = metadata_text([self.summary()], self._provenance)
         self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
         self._writer.finish()
         self._stream.flush()
         os.fsync(self._stream.fileno())
         self._stream.close()
-
-
-def _metadata_yaml(files: list[_File], channels: list[Channel], provenance: Mapping[str, str]) -> str:
-    """The text of rosbag2's metadata.yaml."""
-    topics = [
-        {
-            "topic_metadata": {
-                "name": channel.topic,
-                "type": channel.type,
-                "serialization_format": "cdr",
-                "offered_qos_profiles": [qos.profile() for qos in channel.qos],
-                "type_description_hash": definition(channel.type).type_hash,
-            },
-            "message_count": sum(file.counts.get(channel, 0) for file in files),
-        }
-        for channel in channels
-    ]
-    information = {
-        "version": _METADATA_VERSION,
-        "storage_identifier": "mcap",
-        **_span(files),
-        "message_count": sum(file.message_count for file in files),
-        "topics_with_message_count": topics,
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [file.path.name for file in files],
-        "files": [
-            {
-                "path": file.path.name,
-                **_span([file]),
-                "message_count": file.message_count,
-            }
-            for file in files
-        ],
-        "custom_data": dict(provenance),
-        "ros_distro": "jazzy",
-    }
-    return yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-
-
-def _span(files: list[_File]) -> dict[str, Any]:
-    start = min((file.start_ns for file in files if file.start_ns is not None), default=0)
-    end = max((file.end_ns for file in files if file.end_ns is not None), default=0)
-    return {
-        "duration": {"nanoseconds": end - start},
-        "starting_time": {"nanoseconds_since_epoch": start},
-    }
 
 
 class Recorded(NamedTuple):
@@ -306,11 +229,9 @@ class BagReader:
         self.path = Path(path)
         if not self.path.exists():
             raise InputError(str(self.path), "nothing there", "a rosbag2 directory, .mcap or .db3 file")
-        try:
+        with _readable(self.path):
             self._reader = AnyReader([self.path], default_typestore=typestore())
             self._reader.open()
-        except Exception as error:  # a foreign parser on foreign bytes: any failure means the same
-            raise InputError(str(self.path), _one_line(error), "a readable bag") from error
 
     def __enter__(self) -> BagReader:
         return self
@@ -337,31 +258,29 @@ class BagReader:
         chosen = [c for c in self._reader.connections if wanted is None or c.topic in wanted]
         if not chosen:
             return
-        try:
+        with _readable(self.path):
             for connection, log_time_ns, data in self._reader.messages(chosen):
                 message = self._reader.deserialize(data, connection.msgtype)
                 yield Recorded(connection.topic, connection.msgtype, log_time_ns, message)
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(str(self.path), _one_line(error), "a bag that can be read to its end") from error
 
     def attachments(self) -> dict[str, bytes]:
         """Attachments by name, of the first MCAP file that has them."""
-        for path in self._mcap_files():
-            with path.open("rb") as stream:
-                found = {a.name: a.data for a in make_reader(stream).iter_attachments()}
-            if found:
-                return found
+        with _readable(self.path):
+            for path in self._mcap_files():
+                with path.open("rb") as stream:
+                    found = {a.name: a.data for a in make_reader(stream).iter_attachments()}
+                if found:
+                    return found
         return {}
 
     def provenance(self) -> dict[str, str]:
         """What BagWriter was told of the recording; empty for other people's bags."""
-        for path in self._mcap_files():
-            with path.open("rb") as stream:
-                for record in make_reader(stream).iter_metadata():
-                    if record.name == PROVENANCE:
-                        return dict(record.metadata)
+        with _readable(self.path):
+            for path in self._mcap_files():
+                with path.open("rb") as stream:
+                    for record in make_reader(stream).iter_metadata():
+                        if record.name == PROVENANCE:
+                            return dict(record.metadata)
         return {}
 
     def _mcap_files(self) -> list[Path]:
@@ -369,5 +288,15 @@ class BagReader:
         return [path for path in paths if path.suffix == ".mcap"]
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """One error for whatever foreign parsers raise on foreign bytes."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        found = " ".join(str(error).split()) or type(error).__name__
+        mcap = path.suffix == ".mcap" or any(path.glob("*.mcap"))
+        advice = "; 'mems6dof recover' completes one that was cut off" if mcap else ""
+        raise InputError(str(path), found, f"a readable bag{advice}") from error

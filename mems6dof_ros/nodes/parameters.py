@@ -35,7 +35,7 @@ from rclpy.parameter import Parameter as RosParameter
 from mems6dof_ros.errors import InputError
 
 #: The nodes with a table ``PARAMETERS``.
-NODES = ("frame_source", "localizer", "pose_estimator", "recorder")
+NODES = ("frame_source", "localizer", "pose_estimator", "recorder", "monitor")
 
 Value = bool | int | float | str | Sequence[Any]
 Settings = TypeVar("Settings")

@@ -24,7 +24,8 @@ from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
 from mems6dof_ros.pose.cycle_pose import CyclePose
-from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings
+from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.pose.settings import PoseSettings
 from mems6dof_ros.recording import messages, topics
 
 _SETTINGS = {
@@ -35,13 +36,14 @@ _SETTINGS = {
     ),
     "gates": ("m", "Annealed gates of the iterative closest point, descending."),
     "min_particles": ("particles", "Fewer matched particles give no pose."),
-    "confirm_after": ("cycles", "Sightings in a row before a newcomer joins the map."),
+    "confirm_after": ("cycles", "Sightings of a newcomer before it joins the map."),
     "retire_after": ("cycles", "Misses in a row, where it should be seen, before a particle leaves the map."),
     "overlap": ("m", "Particles closer than this count less until their residuals prove them good."),
     "gate_xy": ("1", "Standard deviations in x and y beyond which a particle is left out."),
     "gate_z": ("1", "Standard deviations in z beyond which the z of a particle is left out."),
     "max_displacement": ("m", "Farther from its centre of rotation no body moves: the pose is lost."),
     "max_tilt": ("rad", "Likewise for the tilt."),
+    "max_centre_distance": ("m", "The centre of rotation lies within this of the field's centre."),
     "max_false_alarms": ("1", "Matches this good that chance gives, log10: the proof against a wrong pose."),
     "field_size": ("m", "Width and height of the field; empty: taken from where particles are seen."),
     "field_degree": ("1", "Degree of the smooth field error that is estimated with the map; 0: none."),

@@ -66,7 +66,7 @@ def use_profile(*, frames: bool) -> str:
         )
     if free < need:
         warning = (
-            f"{_SHARED_MEMORY} has {free} MiB free, {need} MiB are needed: large frames will be slow or lost"
+            f"{_SHARED_MEMORY}: {free} of {need} MiB free: large frames will be slow or lost"
         )
         profile = _MESSAGES[0]
     for name in _PROFILE_VARIABLES:

@@ -93,9 +93,20 @@ class Constellation:
         self._information[k:, k:] += GAUGE_STIFFNESS * held @ np.linalg.solve(normal, held.T)
         self.refine()
 
+    def adopt(self, ids: Indices, position: Array, covariance: Array) -> None:
+        """Start from particles known from elsewhere, whose frame becomes the map frame."""
+        self.add(ids, position, covariance, np.zeros((len(ids), 3, len(self.modes))))
+        first = len(self.modes) + 3 * np.arange(len(ids))
+        for a in range(3):
+            for b in range(a + 1):
+                self._information[first + a, first + b] += np.linalg.inv(covariance)[:, a, b]
+        self.cycles = self._refined_at = 2  # as good as confirmed
+
     def add(self, ids: Indices, position: Array, covariance: Array, coupling: Array) -> None:
         """Add particles (n,) at ``position`` (n, 3) m, known to ``covariance`` until evidence comes in."""
-        n, k, old = len(ids), len(self.modes), len(self._vector)
+        n, old = len(ids), len(self._vector)
+        if n == 0:
+            return
         self.ids = np.r_[self.ids, ids]
         self.active = np.r_[self.active, np.ones(n, bool)]
         self.position = np.r_[self.position, position]
@@ -115,7 +126,6 @@ class Constellation:
         prior = NOISE_PRIOR * np.where(near, OVERLAP_FACTOR, 1.0)
         self._squares = np.r_[self._squares, np.c_[prior, prior]]
         self._freedom = np.r_[self._freedom, np.full((n, 2), NOISE_PRIOR)]
-        assert len(self._vector) == k + 3 * len(self)
 
     def observe(self, rows: Indices, pose: RigidPose, offset: Array, weight: Array, modes: Array) -> None:
         """Add one cycle's evidence on particles ``rows`` (n,) seen at ``pose``.
@@ -290,6 +300,8 @@ class Candidates:
     def add(self, ids: Indices, position: Array, covariance: Array, former: bool) -> None:
         """Add places: newcomers with one sighting, or ``former`` particles with none."""
         n = len(ids)
+        if n == 0:
+            return
         self.ids = np.r_[self.ids, ids]
         self.position = np.r_[self.position, position]
         self.covariance = np.r_[self.covariance, covariance]

@@ -35,16 +35,21 @@ class PlaneMotion(NamedTuple):
         return points @ np.array([[c, s], [-s, c]]) + self.shift
 
 
-def closest_points(predicted: Array, measured: Array, gates: Array) -> tuple[PlaneMotion, Indices]:
+def closest_points(
+    predicted: Array, measured: Array, gates: Array, identity_gate: float
+) -> tuple[PlaneMotion, Indices]:
     """Iterative closest point with annealed gates.
 
     ``predicted`` (m, 2) m: particles at the predicted pose; ``measured`` (n, 2) m; ``gates`` m,
     descending. Pairs are mutual nearest neighbours within the gate, so that one missing or spurious
-    particle cannot force a wrong pair. Returns the motion that takes ``predicted`` onto ``measured`` and,
-    for each localization, the index of its particle or -1.
+    particle cannot force a wrong pair. Returns the motion that takes ``predicted`` onto ``measured`` and, for
+    each localization, the index of its particle within ``identity_gate`` m after that motion, or -1.
     """
     angle, x, y, match = _closest_points(
-        np.ascontiguousarray(predicted), np.ascontiguousarray(measured), np.asarray(gates, float)
+        np.ascontiguousarray(predicted),
+        np.ascontiguousarray(measured),
+        np.asarray(gates, float),
+        identity_gate,
     )
     return PlaneMotion(angle, np.array([x, y])), match
 
@@ -113,40 +118,44 @@ class ConstellationIndex:
 
 
 @njit(cache=True, nogil=True)
-def _closest_points(predicted, measured, gates):  # type: ignore[no-untyped-def]
+def _mutual_neighbours(moved, measured, gate, match, nearest, distance):  # type: ignore[no-untyped-def]
+    """Mutual nearest neighbours within ``gate`` into ``match`` (n,); the other arrays are scratch (m,)."""
+    for j in range(len(moved)):
+        distance[j] = gate * gate
+        nearest[j] = -1
+    for i in range(len(measured)):
+        best, index = gate * gate, -1
+        u, v = measured[i, 0], measured[i, 1]
+        for j in range(len(moved)):
+            dx = u - moved[j, 0]
+            if abs(dx) > gate:
+                continue
+            dy = v - moved[j, 1]
+            d = dx * dx + dy * dy
+            if d < best:
+                best, index = d, j
+            if d < distance[j]:
+                distance[j] = d
+                nearest[j] = i
+        match[i] = index
+    for i in range(len(measured)):
+        if match[i] >= 0 and nearest[match[i]] != i:
+            match[i] = -1
+
+
+@njit(cache=True, nogil=True)
+def _closest_points(predicted, measured, gates, identity_gate):  # type: ignore[no-untyped-def]
     m, n = len(predicted), len(measured)
     moved = predicted.copy()
-    match = np.full(n, -1, np.int64)
-    previous = np.full(n, -1, np.int64)
-    nearest = np.empty(m, np.int64)
-    distance = np.empty(m)
+    match, previous = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
+    nearest, distance = np.empty(m, np.int64), np.empty(m)
     angle = x = y = 0.0
     for gate in gates:
         for _ in range(8):
-            for j in range(m):
-                distance[j] = gate * gate
-                nearest[j] = -1
-            for i in range(n):
-                best, index = gate * gate, -1
-                for j in range(m):
-                    dx = measured[i, 0] - moved[j, 0]
-                    dy = measured[i, 1] - moved[j, 1]
-                    d = dx * dx + dy * dy
-                    if d < best:
-                        best, index = d, j
-                    if d < distance[j]:
-                        distance[j] = d
-                        nearest[j] = i
-                match[i] = index
-            same = True
-            for i in range(n):
-                if match[i] >= 0 and nearest[match[i]] != i:
-                    match[i] = -1
-                if match[i] != previous[i]:
-                    same = False
-                previous[i] = match[i]
-            if same:
+            _mutual_neighbours(moved, measured, gate, match, nearest, distance)
+            if (match == previous).all():
                 break
+            previous[:] = match
             count = 0
             px = py = qx = qy = 0.0
             for i in range(n):
@@ -174,6 +183,7 @@ def _closest_points(predicted, measured, gates):  # type: ignore[no-untyped-def]
             for j in range(m):
                 moved[j, 0] = c * predicted[j, 0] - s * predicted[j, 1] + x
                 moved[j, 1] = s * predicted[j, 0] + c * predicted[j, 1] + y
+    _mutual_neighbours(moved, measured, identity_gate, match, nearest, distance)
     return angle, x, y, match
 
 

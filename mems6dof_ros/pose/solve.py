@@ -25,6 +25,7 @@ UNUSED, LATERAL, FULL = 0, 1, 2
 class Solution(NamedTuple):
     """``pose``; its ``covariance`` (6, 6) in (d, w), see rigid.py; ``noise`` (6, 6), the part of it that
     comes from this frame alone; ``use`` (n,) of UNUSED, LATERAL, FULL; ``residual`` (n, 3) m;
+    ``tested_z`` (n,): where the body's own z is known well enough for the residual to tell something;
     ``distance_xy``, ``distance_z`` (n,) squared normalised residuals; ``chi_square`` and
     ``degrees_of_freedom`` of the whole. ``ok`` is False where the particles do not fix a pose."""
 
@@ -34,6 +35,7 @@ class Solution(NamedTuple):
     noise: Array
     use: NDArray[np.int64]
     residual: Array
+    tested_z: NDArray[np.bool_]
     distance_xy: Array
     distance_z: Array
     chi_square: float
@@ -64,10 +66,11 @@ def solve_pose(
         spread, has_z, gate_xy, gate_z,
     )  # fmt: skip
     pose = RigidPose(rotation, translation)
+    tested_z = body_covariance[:, 2, 2] < 4 * measured_covariance[:, 2, 2]
     count_xy, count_z = int((use > UNUSED).sum()), int((use == FULL).sum())
     if not ok:
         nan = np.full((6, 6), np.nan)
-        return Solution(False, pose, nan, nan, use, residual, distance_xy, distance_z, math.nan, 0)
+        return Solution(False, pose, nan, nan, use, residual, tested_z, distance_xy, distance_z, math.nan, 0)
 
     # The exact solution with the field error common to all: one linear step from a converged start.
     step, covariance, noise, chi_square = _marginalise(
@@ -76,7 +79,7 @@ def solve_pose(
     residual[use == UNUSED] = np.nan
     pose = RigidPose(_exp(step[3:]) @ rotation, translation + step[:3])
     return Solution(
-        True, pose, covariance, noise, use, residual, distance_xy, distance_z,
+        bool(np.isfinite(covariance).all()), pose, covariance, noise, use, residual, tested_z, distance_xy, distance_z,
         chi_square, 2 * count_xy + count_z - 6,
     )  # fmt: skip
 

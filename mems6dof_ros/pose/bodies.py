@@ -1,0 +1,60 @@
+"""Several rigid bodies in one field, each with a pose, and the motion of one relative to another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.localization.localizations import Localizations
+from mems6dof_ros.pose.cycle_pose import CyclePose
+from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.pose.rigid import RigidPose, hat
+
+Array = NDArray[np.float64]
+
+
+class Bodies:
+    """One PoseEstimator per body; a localization that one body claims is not offered to the next.
+
+    Raises InputError where a body cannot be told from the others: with several, each needs a region or
+    a reference constellation, and a name of its own.
+    """
+
+    def __init__(self, estimators: Sequence[PoseEstimator]) -> None:
+        names = [estimator.body for estimator in estimators]
+        if not names or len(set(names)) != len(names):
+            raise InputError("bodies", str(names), "one or more different names")
+        for estimator in estimators:
+            if len(names) > 1 and estimator.region is None and estimator.reference is None:
+                raise InputError(f"body {estimator.body}", "neither", "a region or a reference constellation")
+        self.estimators = tuple(estimators)
+
+    def update(self, localizations: Localizations) -> list[CyclePose]:
+        """Poses of this cycle, in the order of the bodies."""
+        available = np.ones(len(localizations), bool)
+        poses = []
+        for estimator in self.estimators:
+            pose = estimator.update(localizations, available)
+            available &= pose.particle_id < 0
+            poses.append(pose)
+        return poses
+
+    def reset(self) -> None:
+        """Forget everything measured of all bodies."""
+        for estimator in self.estimators:
+            estimator.reset()
+
+
+def relative_pose(of: CyclePose, to: CyclePose) -> tuple[RigidPose, Array]:
+    """Pose of the body ``of`` in the body frame of ``to``, both of one cycle, with covariance (6, 6) in
+    (x, y, z, rotation about the axes of ``to``); the two are measured independently."""
+    back = RigidPose(to.rotation, to.translation).inverse()
+    pose = RigidPose(of.rotation, of.translation).then(back)
+    by_of = np.zeros((6, 6))
+    by_of[:3, :3] = by_of[3:, 3:] = back.rotation
+    by_to = -by_of
+    by_to[:3, 3:] = back.rotation @ hat(of.translation - to.translation)
+    return pose, by_of @ of.covariance @ by_of.T + by_to @ to.covariance @ by_to.T

@@ -1,0 +1,1 @@
+"""Closed loop: commands to a drive, and the controller that decides them from poses. No ROS here."""

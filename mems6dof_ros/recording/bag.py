@@ -8,10 +8,12 @@ neither ``rosbags`` nor ``mcap_ros2`` offers both.
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -25,14 +27,19 @@ from mems6dof_ros import __version__
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording.definitions import definition, typestore
 from mems6dof_ros.recording.messages import Message, serialize
-from mems6dof_ros.recording.metadata import Channel, FileSummary, Qos, metadata_text, write_metadata
+from mems6dof_ros.recording.metadata import (
+    PROVENANCE,
+    Channel,
+    FileSummary,
+    Qos,
+    metadata_text,
+    write_metadata,
+)
+from mems6dof_ros.recording.recover import recover
 
 __all__ = ["BagReader", "BagWriter", "Channel", "Qos", "Recorded"]
 
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
-
-#: Name of the MCAP metadata record with our provenance.
-PROVENANCE = "mems6dof"
 
 
 class BagWriter:
@@ -43,6 +50,9 @@ class BagWriter:
     file and into ``metadata.yaml``. ``flush`` after each motion cycle: what was flushed survives a kill
     of the process; what is older than ``sync_period`` s survives a loss of power. Leaving the context by
     an exception completes the files all the same. Not safe for use by several threads at once.
+
+    With less than ``reserve`` bytes left on the disk, ``flush`` completes the bag and raises OSError
+    (ENOSPC). Any other OSError also ends it, with what is whole completed as far as the disk allows.
     """
 
     def __init__(
@@ -52,6 +62,7 @@ class BagWriter:
         compression: str = "none",
         provenance: Mapping[str, str] | None = None,
         sync_period: float = 1.0,
+        reserve: int = 64 << 20,
     ) -> None:
         self.path = Path(path)
         if compression not in COMPRESSIONS:
@@ -61,7 +72,7 @@ class BagWriter:
         self.path.mkdir(parents=True, exist_ok=True)
         self.provenance = {"mems6dof_ros": __version__, **(provenance or {})}
         self._compression = COMPRESSIONS[compression]
-        self._sync_period = sync_period
+        self._sync_period, self._reserve = sync_period, reserve
         self._channels: list[Channel] = []
         self._attachments: list[tuple[str, bytes, str]] = []
         self._files: list[_File] = []
@@ -93,7 +104,8 @@ class BagWriter:
         sequence: int = 0,
     ) -> None:
         """Append one CDR message: received at ``log_time_ns``, sent at ``publish_time_ns``."""
-        self._files[-1].write(channel, data, log_time_ns, publish_time_ns or log_time_ns, sequence)
+        with self._saving_what_is_whole():
+            self._files[-1].write(channel, data, log_time_ns, publish_time_ns or log_time_ns, sequence)
 
     def write_message(self, topic: str, message: Message, log_time_ns: int) -> None:
         """Append one neutral message, announcing its topic on first use (offline writing)."""
@@ -106,12 +118,17 @@ class BagWriter:
 
     def flush(self) -> None:
         """Hand everything to the operating system, and to the disk once per ``sync_period``."""
-        self._files[-1].flush(self._sync_period)
+        with self._saving_what_is_whole():
+            self._files[-1].flush(self._sync_period)
+        if shutil.disk_usage(self.path).free < self._reserve:
+            self.close()
+            raise OSError(errno.ENOSPC, "the disk is almost full; the bag is complete so far", str(self.path))
 
     def split(self) -> None:
         """Complete the current file and go on in a new one that is readable by itself."""
         if self._files:
-            self._files[-1].close()
+            with self._saving_what_is_whole():
+                self._files[-1].close()
         path = self.path / f"{self.path.name}_{len(self._files)}.mcap"
         self._files.append(_File(path, self._compression, self.provenance))
         for channel in self._channels:
@@ -122,8 +139,21 @@ class BagWriter:
 
     def close(self) -> None:
         """Complete the files and the metadata; harmless when repeated."""
-        self._files[-1].close()
-        self._write_metadata()
+        if self._files[-1].closed:
+            return
+        with self._saving_what_is_whole():
+            self._files[-1].close()
+            self._write_metadata()
+
+    @contextmanager
+    def _saving_what_is_whole(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:
+            self._files[-1].abandon()
+            with suppress(OSError, InputError):
+                recover(self.path)
+            raise
 
     @property
     def size(self) -> int:
@@ -198,9 +228,16 @@ class _File:
             os.fsync(self._stream.fileno())
             self._synced = time.monotonic()
 
+    def abandon(self) -> None:
+        """Close without an end."""
+        with suppress(OSError):
+            self._stream.close()
+
+    @property
+    def closed(self) -> bool:
+        return self._stream.closed
+
     def close(self) -> None:
-        if self._stream.closed:
-            return
         text = metadata_text([self.summary()], self._provenance)
         self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
         self._writer.finish()

@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import yaml
 
 VERSION = 9  # of rosbag2 in Jazzy; Humble reads up to 8 but takes the MCAP file alone
+#: Name of the MCAP metadata record with our provenance.
+PROVENANCE = "mems6dof"
+
 INFINITE_NS = 2**63 - 1  # rmw's "unspecified" duration, as rosbag2 writes it
 
 _DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")

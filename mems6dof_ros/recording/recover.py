@@ -22,8 +22,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from mems6dof_ros.errors import InputError
-from mems6dof_ros.recording.bag import PROVENANCE
-from mems6dof_ros.recording.metadata import Channel, FileSummary, Qos, write_metadata
+from mems6dof_ros.recording.metadata import PROVENANCE, Channel, FileSummary, Qos, write_metadata
 
 _HEAD = struct.Struct("<BQ")  # of a record: opcode, length
 _MESSAGE = struct.Struct("<HIQ")  # of a message: channel, sequence, log time

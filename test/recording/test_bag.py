@@ -24,6 +24,7 @@ from mems6dof_ros.frame import Frame
 from mems6dof_ros.recording import messages
 from mems6dof_ros.recording.bag import BagReader, BagWriter, Qos
 from mems6dof_ros.recording.definitions import definition
+from mems6dof_ros.recording.recover import recover
 
 T0 = 1_700_000_000_000_000_000
 INFO = "mems6dof_msgs/msg/FrameInfo"
@@ -199,3 +200,57 @@ def test_sqlite_bags_of_rosbags_are_read(tmp_path):
             writer.write(connection, T0 + k, messages.serialize(messages.image(frame(k))))
     with BagReader(tmp_path / "bag") as bag:
         assert [m.message.data[0] for m in bag.messages(["/image_raw"])] == [0, 1, 2]
+
+
+def test_an_almost_full_disk_ends_with_a_complete_bag(tmp_path, monkeypatch):
+    from mems6dof_ros.recording import bag as module
+
+    class Usage:
+        free = 10**12
+
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: Usage)
+    bag = BagWriter(tmp_path / "bag")
+    for k in range(7):
+        bag.write_message("/frame_info", messages.frame_info(frame(k)), T0 + k)
+        Usage.free = 10**6 if k == 6 else 10**12
+        if k < 6:
+            bag.flush()
+    with pytest.raises(OSError, match="almost full"):
+        bag.flush()
+    with BagReader(tmp_path / "bag") as bag:
+        assert [m.message.frame_counter for m in bag.messages()] == list(range(7))
+
+
+LIMITED = """
+import resource, sys
+sys.path[:0] = {path!r}
+from test_bag import *
+resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+bag = BagWriter(sys.argv[1])
+written = flushed = 0
+try:
+    for k in range(100000):
+        bag.write_message("/frame_info", messages.frame_info(frame(k)), T0 + k)
+        written += 1
+        bag.write_message("/image_raw", messages.image(frame(k)), T0 + k)
+        if k % 5 == 4:
+            bag.flush()
+            flushed = written
+except OSError as error:
+    print(flushed, written, type(error).__name__)
+bag.close()
+"""
+
+
+@pytest.mark.parametrize("limit", [200_000, 201_111, 222_222])
+def test_a_disk_that_refuses_keeps_what_was_flushed(tmp_path, limit):
+    path = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+    script = LIMITED.format(path=path, limit=limit)
+    command = [sys.executable, "-c", script, str(tmp_path / "bag")]
+    done = subprocess.run(command, check=True, timeout=120, capture_output=True, text=True)
+    flushed, written, _ = done.stdout.split()
+    assert 20 < int(flushed) <= int(written) <= int(flushed) + 5
+    recover(tmp_path / "bag")  # where there was no room even for the end
+    with BagReader(tmp_path / "bag") as bag:
+        counters = [m.message.frame_counter for m in bag.messages(["/frame_info"])]
+    assert counters == list(range(int(flushed)))

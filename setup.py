@@ -27,7 +27,7 @@ setup(
     author="mems6dof developers",
     maintainer="mems6dof developers",
     maintainer_email="maintainers@mems6dof.invalid",
-    description="Particle tracking of a microsystem in three dimensions and six degrees of freedom, live on ROS 2",
+    description="Particle tracking of a microsystem in three dimensions and six degrees of freedom on ROS 2",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
@@ -37,6 +37,7 @@ setup(
             "pose_estimator = mems6dof_ros.nodes.pose_estimator:main",
             "recorder = mems6dof_ros.nodes.recorder:main",
             "monitor = mems6dof_ros.nodes.monitor:main",
+            "foxglove_bridge = mems6dof_ros.nodes.foxglove_bridge:main",
         ],
     },
 )

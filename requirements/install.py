@@ -18,7 +18,7 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 LOCKS = [ROOT / "requirements" / f"{name}.txt" for name in ("runtime", "ros", "dev")]
 PACKAGE = "mems6dof_ros"
-NODES = ("frame_source", "localizer", "pose_estimator", "recorder", "monitor")
+NODES = ("frame_source", "localizer", "pose_estimator", "recorder", "monitor", "foxglove_bridge")
 # What a sourced ROS or another activated wheel environment would push into ours.
 FOREIGN = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "PYTHONHOME")
 
@@ -36,8 +36,8 @@ def refuse_sourced_ros() -> None:
     distribution = os.environ.get("ROS_DISTRO")
     if distribution or "/opt/ros/" in os.environ.get("AMENT_PREFIX_PATH", ""):
         stop(
-            f"A ROS environment is sourced ({distribution or 'AMENT_PREFIX_PATH'}), and two ROS installations do not"
-            " mix. Either open a shell without it and run make again, or build here with\n"
+            f"A ROS environment is sourced ({distribution or 'AMENT_PREFIX_PATH'}), and two ROS installations"
+            " do not mix. Either open a shell without it and run make again, or build here with\n"
             "  rosdep install --from-paths . --ignore-src -y\n"
             "  colcon build --base-paths . mems6dof_msgs && source install/setup.bash\n"
             "  ros2 launch mems6dof_ros demo.launch.py"

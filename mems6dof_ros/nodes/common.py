@@ -1,22 +1,20 @@
-"""What every node here is made of: a bounded queue with a worker, diagnostics, a clean start and end."""
+"""What every node here is: parameters, a queue with its worker, diagnostics, a clean start and end."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import signal
-import statistics
 import sys
 import threading
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from types import FrameType
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -24,15 +22,12 @@ from rclpy.signals import SignalHandlerOptions
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.health import Health
 from mems6dof_ros.nodes.parameters import Parameter, declare
-
-Item = TypeVar("Item")
+from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT, Worker
 
 #: Environment variable by which the runner tells a node its process id.
 PARENT_VARIABLE = "MEMS6DOF_PARENT"
-
-#: Seconds that the end of a node may take: for what is queued, then for what readers have not yet taken.
-DRAIN_TIMEOUT = 3.0
 
 QUEUE_PARAMETERS = (
     Parameter("queue_size", 16, "Messages that wait for the computation.", "messages", (1, 100_000)),
@@ -50,176 +45,6 @@ WAIT_PARAMETER = Parameter(
     "Publish nothing before each of these topics has so many subscribers, so that nobody misses the"
     " beginning: a list of topic:number.",
 )
-
-
-class Worker(Generic[Item]):
-    """A thread that takes items out of a bounded queue and calls ``work`` with each.
-
-    Callbacks only ``put``. ``policy`` when ``capacity`` items wait: ``block`` until there is room, or
-    ``drop_oldest`` and count it in ``dropped``. An exception of ``work`` ends the thread and is kept
-    in ``failure``.
-    """
-
-    def __init__(
-        self,
-        work: Callable[[Item], None],
-        capacity: int,
-        policy: Literal["block", "drop_oldest"] = "block",
-    ) -> None:
-        self.dropped = 0
-        self.failure: BaseException | None = None
-        self._work, self._capacity, self._policy = work, capacity, policy
-        self._items: deque[Item] = deque()
-        self._changed = threading.Condition()
-        self._busy = self._ending = False
-        self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
-        self._thread.start()
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    def put(self, item: Item) -> None:
-        """Append ``item``, see ``policy``; ignored once the worker has ended."""
-        with self._changed:
-            if self._policy == "drop_oldest" and len(self._items) >= self._capacity:
-                self._items.popleft()
-                self.dropped += 1
-            while len(self._items) >= self._capacity and not self._ending:
-                self._changed.wait()
-            if not self._ending:
-                self._items.append(item)
-                self._changed.notify_all()
-
-    def end(self, timeout: float = DRAIN_TIMEOUT) -> int:
-        """Let the worker finish what is queued, for ``timeout`` s at most; returns how many items it left."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._ending or not (self._items or self._busy), timeout)
-            left = len(self._items) + self._busy
-            self._ending = True
-            self._items.clear()
-            self._changed.notify_all()
-        self._thread.join(timeout=1.0)
-        return left
-
-    def _run(self) -> None:
-        try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._items or self._ending)
-                    if self._ending:
-                        return
-                    item = self._items.popleft()
-                    self._busy = True
-                    self._changed.notify_all()
-                self._work(item)
-                with self._changed:
-                    self._busy = False
-                    self._changed.notify_all()
-        except BaseException as error:  # handed to the main thread, which ends the node
-            with self._changed:
-                self.failure = error
-                self._ending, self._busy = True, False
-                self._changed.notify_all()
-
-
-class Health:
-    """Counts and times of a node, published on /diagnostics once per second; safe for any thread.
-
-    The level is WARN while something was lost, ERROR while something was refused, in the last second.
-    """
-
-    PERIOD = 1.0  # s
-    MOST_LINES = 10  # that are logged of the problems of one period
-
-    def __init__(self, node: Node, hardware_id: str = "") -> None:
-        self.state = "starting"
-        self._node, self._hardware_id = node, hardware_id
-        self._lock = threading.Lock()
-        self._totals: dict[str, int] = defaultdict(int)
-        self._reported: dict[str, int] = {}
-        self._times: dict[str, list[float]] = defaultdict(list)
-        self._values: dict[str, str] = {}
-        self._problems: list[tuple[bytes, str]] = []
-        self._gauges: dict[str, Callable[[], Any]] = {}
-        self._since = time.monotonic()
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", transport.MESSAGES)
-        # Wall time: with use_sim_time and no clock, diagnostics must still say so.
-        node.create_timer(self.PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def count(self, what: str, number: int = 1) -> None:
-        """Add to a total, reported with its rate."""
-        with self._lock:
-            self._totals[what] += number
-
-    def total(self, what: str) -> int:
-        """A total so far."""
-        with self._lock:
-            return self._totals[what]
-
-    def time(self, what: str, seconds: float) -> None:
-        """Add a duration in s, reported as median and maximum of the period in ms."""
-        with self._lock:
-            self._times[what].append(seconds)
-
-    def set(self, what: str, value: Any) -> None:
-        """Note the latest value of something."""
-        with self._lock:
-            self._values[what] = str(value)
-
-    def gauge(self, what: str, read: Callable[[], Any]) -> None:
-        """Have ``read`` called for every report."""
-        self._gauges[what] = read
-
-    def lost(self, number: int, why: str) -> None:
-        """Something was lost: count it and warn."""
-        self._problem(DiagnosticStatus.WARN, "lost", number, why)
-
-    def refused(self, why: str) -> None:
-        """Input that could not be used: count it and report an error."""
-        self._problem(DiagnosticStatus.ERROR, "refused", 1, why)
-
-    def _problem(self, level: bytes, what: str, number: int, why: str) -> None:
-        with self._lock:
-            self._totals[what] += number
-            self._problems.append((level, why))
-            if len(self._problems) > self.MOST_LINES:
-                return
-        log = self._node.get_logger()
-        if level == DiagnosticStatus.ERROR:
-            log.error(why)
-        else:
-            log.warning(why)
-
-    def publish(self) -> None:
-        """Publish the report of the time since the last one."""
-        now = time.monotonic()
-        with self._lock:
-            span, self._since = now - self._since, now
-            values = {what: str(total) for what, total in self._totals.items()}
-            for what, total in self._totals.items():
-                values[f"{what}, 1/s"] = f"{(total - self._reported.get(what, 0)) / span:.1f}"
-            self._reported = dict(self._totals)
-            for what, times in self._times.items():
-                if times:
-                    values[f"{what}, ms, median"] = f"{statistics.median(times) * 1e3:.2f}"
-                    values[f"{what}, ms, max"] = f"{max(times) * 1e3:.2f}"
-                times.clear()
-            values.update(self._values)
-            problems, self._problems = self._problems, []
-        if (more := len(problems) - self.MOST_LINES) > 0:
-            self._node.get_logger().warning(f"and {more} more problems in the last second")
-        values.update({what: str(read()) for what, read in self._gauges.items()})
-        level, message = max(problems, default=(DiagnosticStatus.OK, self.state), key=lambda p: p[0])
-        status = DiagnosticStatus(
-            level=level,
-            name=self._node.get_fully_qualified_name().lstrip("/"),
-            message=message,
-            hardware_id=self._hardware_id,
-            values=[KeyValue(key=key, value=value) for key, value in sorted(values.items())],
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array)
 
 
 class InstrumentNode(Node):
@@ -296,6 +121,9 @@ class InstrumentNode(Node):
         """Finish what is queued and release everything; ``spin(s)`` lets callbacks run meanwhile."""
         if self.worker and (left := self.worker.end()):
             self.get_logger().warning(f"{left} messages left in the queue")
+        deadline = time.monotonic() + DRAIN_TIMEOUT
+        for publisher in self.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=max(deadline - time.monotonic(), 0.0)))
 
 
 def required_subscribers(entries: Sequence[str], topics: Collection[str]) -> dict[str, int]:

@@ -17,10 +17,10 @@ import enum
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
@@ -29,8 +29,9 @@ from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import DRAIN_TIMEOUT, WAIT_PARAMETER, InstrumentNode, run
+from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter, of_settings
+from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.source import SOURCES, open_source
@@ -157,15 +158,14 @@ class FrameSourceNode(InstrumentNode):
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
         self.when_ready(self.missing_subscribers(self._topics), self._thread.start)
 
-    def end(self, spin: Any) -> None:
+    def end(self, spin: Callable[[float], None]) -> None:
         with self._changed:
             self._abandon = True
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(DRAIN_TIMEOUT)
         self._source.stop()
-        for publisher in self._topics.values():
-            publisher.wait_for_all_acked(Duration(seconds=DRAIN_TIMEOUT))
+        super().end(spin)
         self.get_logger().info(
             f"{self.health.total('frames')} frames published, {self.health.total('refused')} refused,"
             f" {self.health.total('lost')} lost"

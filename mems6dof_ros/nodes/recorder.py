@@ -24,8 +24,9 @@ from std_srvs.srv import Trigger
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import DRAIN_TIMEOUT, InstrumentNode, run
+from mems6dof_ros.nodes.common import InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter
+from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import COMPRESSIONS, BagWriter, Channel, Qos
 

@@ -277,8 +277,8 @@ def run_system(
 ) -> Iterator[RunningSystem]:
     """Start the nodes as processes, and stop them all at the end of the context, however it ends.
 
-    ``config``: directory of parameter files; ``environment``: what is added to ours, by default
-    discovery limited to this machine; ``on_line`` gets every line they print, with the node's name.
+    ``config``: directory of parameter files; ``environment``: for variables that ours does not set, by
+    default discovery limited to this machine; ``on_line`` gets every line they print, with the node's name.
     """
     processes: dict[str, subprocess.Popen[str]] = {}
     readers = []
@@ -291,7 +291,7 @@ def run_system(
                 stderr=subprocess.STDOUT,
                 text=True,
                 errors="replace",
-                env={**_ENVIRONMENT, **os.environ, **environment, PARENT_VARIABLE: str(os.getpid())},
+                env={**_PLAIN_LINES, **environment, **os.environ, PARENT_VARIABLE: str(os.getpid())},
                 start_new_session=True,  # Ctrl-C reaches us alone, and we stop them in order
             )
             processes[node.executable] = process
@@ -305,7 +305,7 @@ def run_system(
             reader.join(timeout=1.0)
 
 
-_ENVIRONMENT = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": "{severity} {message}"}
+_PLAIN_LINES = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": "{severity} {message}"}
 
 
 def command(node: NodeSpec, namespace: str = "", config: str = "") -> list[str]:

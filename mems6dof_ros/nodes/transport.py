@@ -65,9 +65,7 @@ def use_profile(*, frames: bool) -> str:
             f" remove {_SHARED_MEMORY}/fastrtps_* left by killed processes while no ROS 2 process runs"
         )
     if free < need:
-        warning = (
-            f"{_SHARED_MEMORY}: {free} of {need} MiB free: large frames will be slow or lost"
-        )
+        warning = f"{_SHARED_MEMORY}: {free} of {need} MiB free: large frames will be slow or lost"
         profile = _MESSAGES[0]
     for name in _PROFILE_VARIABLES:
         os.environ[name] = str(profile)

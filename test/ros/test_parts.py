@@ -17,10 +17,10 @@ import yaml
 
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import Worker
 from mems6dof_ros.nodes.frame_matcher import FrameMatcher
 from mems6dof_ros.nodes.parameters import NODES, Parameter, as_yaml, config_text
 from mems6dof_ros.nodes.system import SYSTEMS
+from mems6dof_ros.nodes.worker import Worker
 from mems6dof_ros.recording import messages
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -25,6 +25,8 @@ from mems6dof_ros.sources.source import FrameSource
 #: Called as progress(done, total) after every frame; total 0: unknown.
 Progress = Callable[[int, int], None]
 
+_FLUSH_EVERY = 50  # frames: so much is computed again soon, and chunks of one frame compress badly
+
 
 @dataclass
 class Summary:
@@ -93,9 +95,10 @@ def analyze(
                     cycles.write(pose)
                 for sighting in sightings(found, poses):
                     particles.write(sighting)
-                for writer in (bag, cycles, particles):
-                    writer.flush()
                 _count(summary, frame, found, poses)
+                if summary.frames % _FLUSH_EVERY == 0:
+                    for writer in (bag, cycles, particles):
+                        writer.flush()
                 progress(summary.frames + len(summary.refused), source.info.frames or 0)
                 if stopped():
                     summary.interrupted = True

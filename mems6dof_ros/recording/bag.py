@@ -109,7 +109,9 @@ class BagWriter:
 
     def write_message(self, topic: str, message: Message, log_time_ns: int) -> None:
         """Append one neutral message, announcing its topic on first use (offline writing)."""
-        self.write(self.add_channel(topic, message.type), serialize(message), log_time_ns)
+        channel = self.add_channel(topic, message.type)
+        sequence = 1 + sum(file.counts.get(channel, 0) for file in self._files)
+        self.write(channel, serialize(message), log_time_ns, sequence=sequence)
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file's content, for instance the calibration, to this and all later files."""
@@ -182,7 +184,8 @@ class _File:
         self._provenance = provenance
         self._synced = time.monotonic()
         self._stream = path.open("xb")
-        self._writer = Writer(self._stream, compression=compression)
+        # The library also writes offsets to groups of the summary that are empty, which validators refuse.
+        self._writer = Writer(self._stream, compression=compression, use_summary_offsets=False)
         self._writer.start(profile="ros2", library=f"mems6dof_ros {__version__}")
         self._writer.add_metadata(PROVENANCE, dict(provenance))
         self._writer.flush()

@@ -71,6 +71,7 @@ def test_mcap_ros2_reads_it_back_with_everything_beside_the_messages(tmp_path):
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
         decoded = list(reader.iter_decoded_messages(topics=["/frame_info"]))
+        every = list(reader.iter_messages())
         attachments = {a.name: a.data for a in reader.iter_attachments()}
         metadata = {m.name: m.metadata for m in reader.iter_metadata()}
     assert summary.statistics.message_count == 20
@@ -87,6 +88,8 @@ def test_mcap_ros2_reads_it_back_with_everything_beside_the_messages(tmp_path):
         assert channel.message_encoding == "cdr"
         assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
         assert yaml.safe_load(channel.metadata["offered_qos_profiles"])[0]["reliability"] == "reliable"
+    sequences = [m.sequence for _, c, m in every if c.topic == "/image_raw"]
+    assert sequences == list(range(1, 11))
     _, _, message, ros = decoded[3]
     assert (message.log_time, message.publish_time, message.sequence) == (T0 + 30000500, T0 + 30000100, 3)
     assert (ros.frame_counter, ros.header.frame_id, ros.source) == (3, "microscope", "test")

@@ -54,8 +54,9 @@ class Camera:
         self._signal = np.zeros(shape, np.int32)
         self._rng = rng
 
-    def expose(self, images: ParticleImages) -> NDArray[np.generic]:
-        """One digital image (height, width), uint8 or uint16, of the rendered ``images`` on background."""
+    def expose(self, images: ParticleImages, *, covered: bool = False) -> NDArray[np.generic]:
+        """One digital image (height, width), uint8 or uint16, of the rendered ``images`` on background, or on
+        none where the lens is ``covered``."""
         height, width = self._signal.shape
         side = images.image.shape[-1]
         touched = []
@@ -69,8 +70,9 @@ class Camera:
             touched.append((rows, columns))
         by, bx, ry, rx = self._rng.integers(0, self._margin + 1, 4)
         digital = np.empty((height, width), self._dtype)
+        background = self._background[by : by + height, bx : bx + width]
         _digitize(
-            self._background[by : by + height, bx : bx + width],
+            np.zeros_like(self._background)[by : by + height, bx : bx + width] if covered else background,
             self._read[ry : ry + height, rx : rx + width],
             self._signal,
             self.gain_map,

@@ -13,20 +13,28 @@ from scipy.spatial.transform import Rotation
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.simulation.microscope import Body, Microscope
-from mems6dof_ros.simulation.microsystem import BodyPose, LoadGear, scatter_particles
+from mems6dof_ros.simulation.microsystem import (
+    BodyPose,
+    LoadGear,
+    RingGear,
+    load_gear_particles,
+    scatter_particles,
+)
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 
 class Experiment:
     """The load gear under the microscope: ``advance`` the drive, take a ``frame``, repeat.
 
-    ``microscope.camera`` tells what a localizer must know of the camera; ``gear`` is the truth.
+    ``microscope.camera`` tells what a localizer must know of the camera; ``gear`` is the truth. What may
+    happen to a measurement, from the next frame on: ``cover``, ``shift``, ``exchange_particles``.
     """
 
     def __init__(self, settings: SimulationSettings) -> None:
         self.settings = settings
         self.microscope = Microscope(settings, np.random.default_rng([settings.seed, 10]))
         self.gear = LoadGear(settings)
+        self.ring = RingGear(settings) if settings.ring_particles else None
         half_width, half_height = (0.5 * size * settings.pixel_size for size in settings.image_size)
         self._strays = scatter_particles(
             settings,
@@ -36,12 +44,29 @@ class Experiment:
         )
         self._period = 0
         self._exposed = False
+        self._covered = False
+        self._shift = np.zeros(3)
 
     def advance(self, cycles: int = 1, direction: int = 1, amplitude: float = 1.0) -> None:
         """Drive the gear, see LoadGear.advance; the clock moves by one frame period per cycle."""
         self.gear.advance(cycles, direction, amplitude)
+        if self.ring:
+            self.ring.jolt(cycles)
         self._period += cycles
         self._exposed = self._exposed and cycles == 0
+
+    def cover(self, covered: bool = True) -> None:
+        """Cover the lens, or uncover it: no light at all."""
+        self._covered = covered
+
+    def shift(self, x: float, y: float) -> None:
+        """Move everything in view by ``x``, ``y`` m from where it belongs, as a stage that was knocked."""
+        self._shift = np.array([x, y, 0.0])
+
+    def exchange_particles(self, seed: int) -> None:
+        """Put another constellation on the load gear, as its ``seed`` gives it; ``settings.seed`` puts the
+        right one back."""
+        self.gear.particles = load_gear_particles(dataclasses.replace(self.settings, seed=seed))
 
     def frame(self) -> Frame:
         """Expose the gear as it stands; a second frame without a cycle between comes a period later."""
@@ -50,11 +75,22 @@ class Experiment:
         self._exposed = True
         pose = self.gear.pose(self._period / self.settings.frame_rate)
         bodies = [Body(self.gear.name, self.gear.particles, self.gear.electrons(), pose)]
+        if self.ring:
+            particles = self.ring.particles
+            bodies.append(Body(self.ring.name, particles, particles.electrons, self.ring.pose(self.gear)))
         if len(self._strays.electrons):
             still = BodyPose(np.eye(3), np.array([0, 0, self.settings.gear_z]), 0.0)
             bodies.append(Body("strays", self._strays, self._strays.electrons, still))
+        moved = [
+            body._replace(pose=body.pose._replace(translation=body.pose.translation + self._shift))
+            for body in bodies
+        ]
         return self.microscope.frame(
-            bodies, period=self._period, cycle=self.gear.cycle, stage_z=self.settings.stage_z
+            moved,
+            period=self._period,
+            cycle=self.gear.cycle,
+            stage_z=self.settings.stage_z,
+            covered=self._covered,
         )
 
 

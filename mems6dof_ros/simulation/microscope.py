@@ -44,11 +44,12 @@ class Microscope:
         cycle: int,
         stage_z: float,
         focal_plane: float | None = None,
+        covered: bool = False,
     ) -> Frame:
         """Expose ``bodies`` in clock period number ``period`` with the stage at ``stage_z`` m.
 
         ``focal_plane`` m is where the stage really is, if not where it says. The truth's z, and the z of
-        its translation, count from that plane, as the microscope frame does.
+        its translation, count from that plane, as the microscope frame does. ``covered``: without light.
         """
         settings = self.settings
         focal_plane = stage_z if focal_plane is None else focal_plane
@@ -58,7 +59,7 @@ class Microscope:
             translation = body.pose.translation - [0, 0, focal_plane]
             position = body.particles.position @ body.pose.rotation.T + translation
             pixel = position[:, :2] / settings.pixel_size
-            light = body.electrons * illumination(pixel[:, 0], pixel[:, 1], settings)
+            light = body.electrons * illumination(pixel[:, 0], pixel[:, 1], settings) * (not covered)
             inside = (np.abs(pixel) < size / 2).all(axis=1)
             truth.append(
                 GroundTruth(
@@ -82,7 +83,7 @@ class Microscope:
             settings.image_size,
         )
         frame = Frame(
-            image=self.camera.expose(images),
+            image=self.camera.expose(images, covered=covered),
             stamp_ns=settings.epoch_ns + round(period * 1e9 / settings.frame_rate),
             frame_counter=self._frames,
             cycle=cycle,

@@ -1,4 +1,4 @@
-"""The load gear: particles on it, how its drive turns it, and how it departs from pure rotation."""
+"""The gears: particles on them, how the drive turns them, and how they depart from pure rotation."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from mems6dof_ros.simulation.settings import SimulationSettings
 
 #: Drive amplitude, relative to nominal, up to which friction holds the gear.
 STICTION = 0.3
+
+#: Teeth of the load gear per tooth of the ring gear, whose rotation is opposite.
+RING_RATIO = 80 / 200
 
 _PLAY_MEMORY = 0.6  # correlation of the place within the clearance from one cycle to the next
 
@@ -36,45 +39,63 @@ class BodyPose(NamedTuple):
     psi: float
 
 
+class _Seat:
+    """How a body sits on its axis, but for its rotation: eccentricity, tilts, and play anew in every cycle.
+
+    ``R = Swing(t_0 + Rz(psi) t_b + t_play) Rz(psi)``: tilts fixed in the field, turning with the body,
+    and within the clearance. ``t = c_0 + Rz(psi) e + play + stage``: eccentricity e of the body's origin.
+    Play in x and y is confined to a disc of the clearance's diameter.
+    """
+
+    def __init__(
+        self, settings: SimulationSettings, fixed: np.random.Generator, play: np.random.Generator
+    ) -> None:
+        self._settings, self._rng = settings, play
+        self._eccentricity = settings.eccentricity * _direction(fixed)
+        self._tilt_field = settings.tilt_field * _direction(fixed)
+        self._tilt_body = settings.tilt_body * _direction(fixed)
+        # Latent places within the clearances: x, y; z; tilt x, tilt y.
+        self._place = 0.8 * play.standard_normal(5)
+
+    def jolt(self) -> None:
+        """A motion cycle."""
+        push = self._rng.standard_normal(5)
+        self._place = _PLAY_MEMORY * self._place + 0.8 * math.sqrt(1 - _PLAY_MEMORY**2) * push
+
+    def pose(self, psi: float, centre: NDArray[np.float64], stage: NDArray[np.float64]) -> BodyPose:
+        """Pose at ``psi`` rad about ``centre`` (3,) m, all of it moved by ``stage`` (3,) m."""
+        settings = self._settings
+        turn = Rotation.from_rotvec([0, 0, psi])
+        turn_xy = turn.as_matrix()[:2, :2]
+        tilt = self._tilt_field + turn_xy @ self._tilt_body + settings.tilt_play * _confined(self._place[3:5])
+        translation = centre.copy()
+        translation[:2] += turn_xy @ self._eccentricity + settings.play / 2 * _confined(self._place[:2])
+        translation[2] += settings.play_z / 2 * _confined(self._place[2:3])[0]
+        swing = Rotation.from_rotvec([*tilt, 0])
+        return BodyPose((swing * turn).as_matrix(), translation + stage, psi)
+
+
 class LoadGear:
     """The load gear on its drive, one motion cycle at a time.
 
-    Drive. A cycle at relative ``amplitude`` a turns the drive by ``step (1 + e) g(a)`` plus jitter, where
+    A cycle at relative ``amplitude`` a turns the drive by ``step (1 + e) g(a)`` plus jitter, where
     e is the gain error of this gear (under- or over-drive) and g rises linearly from 0 at STICTION to
     1 at a = 1 (and on to 1.5). Cycles may stall or skip at random. The gear follows the drive with
     backlash. Nothing pulls it back to its teeth: errors add up, as a controller must expect.
-
-    Pose. ``R = Swing(t_0 + Rz(psi) t_b + t_play) Rz(psi)``: tilts fixed in the field, turning with the body,
-    and within the clearance. ``t = c_0 + Rz(psi) e + play + drift + vibration``: eccentricity e of the
-    body's origin. Play in x and y is confined to a disc of the clearance's diameter.
     """
 
     name = "load_gear"
 
     def __init__(self, settings: SimulationSettings) -> None:
         self._settings = settings
-        self.particles = scatter_particles(
-            settings,
-            np.random.default_rng([settings.seed, 1]),
-            count=settings.particles,
-            outer_radius=settings.gear_diameter / 2,
-            inner_radius=settings.hub_diameter / 2,
-            relief=settings.height_relief,
-            clumps=settings.clumps,
-        )
+        self.particles = load_gear_particles(settings)
         fixed = np.random.default_rng([settings.seed, 2])
         self._drive_rng = np.random.default_rng([settings.seed, 3])
-        self._play_rng = np.random.default_rng([settings.seed, 4])
-        self._vibration_rng = np.random.default_rng([settings.seed, 5])
         self._light_rng = np.random.default_rng([settings.seed, 6])
 
         self._drive_gain = 1 + settings.step_error * fixed.standard_normal()
-        self._eccentricity = settings.eccentricity * _direction(fixed)
-        self._tilt_field = settings.tilt_field * _direction(fixed)
-        self._tilt_body = settings.tilt_body * _direction(fixed)
-        self._drift = np.append(
-            settings.drift_xy * _direction(fixed), settings.drift_z * fixed.choice([-1, 1])
-        )
+        self._seat = _Seat(settings, fixed, np.random.default_rng([settings.seed, 4]))
+        self._stage = _Stage(settings, fixed, np.random.default_rng([settings.seed, 5]))
         self._bleaching = settings.bleaching * np.exp(
             0.3 * fixed.standard_normal(len(self.particles.electrons))
         )
@@ -83,9 +104,14 @@ class LoadGear:
         self.cycle = 0
         #: Rotation about the axis, rad, unwrapped.
         self.psi = 0.0
+        #: Drift and vibration (3,) m in the latest pose.
+        self.stage = np.zeros(3)
         self._drive_angle = settings.backlash / 2  # engaged for forward motion
-        # Latent places within the clearances: x, y; z; tilt x, tilt y.
-        self._place = 0.8 * self._play_rng.standard_normal(5)
+
+    @property
+    def drive_psi(self) -> float:
+        """What the drive has turned by, rad: the gear's psi, but for its backlash."""
+        return self._drive_angle - self._settings.backlash / 2
 
     def advance(self, cycles: int = 1, direction: int = 1, amplitude: float = 1.0) -> None:
         """Drive ``cycles`` motion cycles forward (``direction`` +1) or back (-1).
@@ -113,32 +139,88 @@ class LoadGear:
                 self._drive_angle += direction * turn
                 half = settings.backlash / 2
                 self.psi = min(max(self.psi, self._drive_angle - half), self._drive_angle + half)
-            push = self._play_rng.standard_normal(5)
-            self._place = _PLAY_MEMORY * self._place + 0.8 * math.sqrt(1 - _PLAY_MEMORY**2) * push
+            self._seat.jolt()
             self.cycle += 1
 
     def pose(self, elapsed: float) -> BodyPose:
         """Pose after ``elapsed`` s of drift, with the vibration of this moment (drawn anew each call)."""
+        self.stage = self._stage.at(elapsed)
         settings = self._settings
-        turn = Rotation.from_rotvec([0, 0, self.psi])
-        turn_xy = turn.as_matrix()[:2, :2]
-        tilt = self._tilt_field + turn_xy @ self._tilt_body + settings.tilt_play * _confined(self._place[3:5])
-        translation = np.array([settings.gear_x, settings.gear_y, settings.gear_z])
-        translation[:2] += turn_xy @ self._eccentricity + settings.play / 2 * _confined(self._place[:2])
-        translation[2] += settings.play_z / 2 * _confined(self._place[2:3])[0]
-        translation += self._drift * elapsed
-        translation += self._vibration_rng.standard_normal(3) * [
-            settings.vibration_xy,
-            settings.vibration_xy,
-            settings.vibration_z,
-        ]
-        swing = Rotation.from_rotvec([*tilt, 0])
-        return BodyPose((swing * turn).as_matrix(), translation, self.psi)
+        return self._seat.pose(
+            self.psi, np.array([settings.gear_x, settings.gear_y, settings.gear_z]), self.stage
+        )
 
     def electrons(self) -> NDArray[np.float64]:
         """Electrons (n,) of the particles now, after bleaching; 0 where one happens to be dark."""
         light = self.particles.electrons * np.exp(-self._bleaching * self.cycle)
         return np.where(self._light_rng.random(len(light)) < self._settings.missing, 0.0, light)
+
+
+class RingGear:
+    """The ring gear, which the actuator turns and which drives the load gear: a second rigid body.
+
+    Its particles lie on the part of it that faces the load gear; it turns by -RING_RATIO of the drive,
+    without backlash, and sits on an axis of its own with tilts and play of its own.
+    """
+
+    name = "ring_gear"
+
+    def __init__(self, settings: SimulationSettings) -> None:
+        self._settings = settings
+        outer = settings.ring_diameter / 2
+        self.particles = scatter_particles(
+            settings,
+            np.random.default_rng([settings.seed, 8]),
+            count=settings.ring_particles,
+            outer_radius=outer,
+            inner_radius=outer - settings.ring_width,
+            relief=settings.height_relief,
+        )
+        fixed = np.random.default_rng([settings.seed, 9])
+        self._seat = _Seat(settings, fixed, np.random.default_rng([settings.seed, 12]))
+        distance = outer + settings.gear_diameter / 2
+        self._centre = np.array([settings.gear_x, settings.gear_y, settings.gear_z])
+        self._centre[0] += distance * math.cos(settings.ring_direction)
+        self._centre[1] += distance * math.sin(settings.ring_direction)
+
+    def jolt(self, cycles: int) -> None:
+        """Motion cycles have been made."""
+        for _ in range(cycles):
+            self._seat.jolt()
+
+    def pose(self, gear: LoadGear) -> BodyPose:
+        """Pose when the drive of ``gear``, and the stage, are where its last pose found them."""
+        return self._seat.pose(-RING_RATIO * gear.drive_psi, self._centre, gear.stage)
+
+
+class _Stage:
+    """What moves everything in view: drift and vibration."""
+
+    def __init__(
+        self, settings: SimulationSettings, fixed: np.random.Generator, vibration: np.random.Generator
+    ) -> None:
+        self._drift = np.append(
+            settings.drift_xy * _direction(fixed), settings.drift_z * fixed.choice([-1, 1])
+        )
+        self._vibration = np.array([settings.vibration_xy, settings.vibration_xy, settings.vibration_z])
+        self._rng = vibration
+
+    def at(self, elapsed: float) -> NDArray[np.float64]:
+        """Displacement (3,) m after ``elapsed`` s."""
+        return self._drift * elapsed + self._rng.standard_normal(3) * self._vibration
+
+
+def load_gear_particles(settings: SimulationSettings) -> Particles:
+    """The constellation of the load gear that ``settings`` describe."""
+    return scatter_particles(
+        settings,
+        np.random.default_rng([settings.seed, 1]),
+        count=settings.particles,
+        outer_radius=settings.gear_diameter / 2,
+        inner_radius=settings.hub_diameter / 2,
+        relief=settings.height_relief,
+        clumps=settings.clumps,
+    )
 
 
 def scatter_particles(

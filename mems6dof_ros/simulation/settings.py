@@ -80,6 +80,14 @@ class SimulationSettings:
     gear_z: float = _number(0.0, "m", -5e-5, 5e-5, "mean height of the gear")
     stage_z: float = _number(0.0, "m", -1e-3, 1e-3, "position of the focal plane")
 
+    # Ring gear, a second body, in view where the load gear is moved aside by gear_x or gear_y.
+    ring_particles: int = _number(0, "1", 0, 5000, "particles all around the ring gear; 0: no ring gear")
+    ring_diameter: float = _number(
+        820e-6, "m", 1e-6, 5e-3, "diameter of the ring gear, outside the load gear"
+    )
+    ring_width: float = _number(100e-6, "m", 1e-6, 5e-3, "width of its rim, which carries the particles")
+    ring_direction: float = _number(0.0, "rad", -math.pi, math.pi, "where it lies, seen from the load gear")
+
     # Drive.
     step: float = _number(math.pi / 40, "rad", -math.pi, math.pi, "nominal rotation per motion cycle")
     step_error: float = _number(
@@ -112,6 +120,10 @@ class SimulationSettings:
             _refuse("saturation_adu", self.saturation_adu, f"at most {limit} for {self.pixel_format}")
         if self.hub_diameter >= self.gear_diameter:
             _refuse("hub_diameter", self.hub_diameter, f"less than gear_diameter, {self.gear_diameter} m")
+        if self.ring_width > self.ring_diameter / 2:
+            _refuse(
+                "ring_width", self.ring_width, f"at most {self.ring_diameter / 2} m, half of ring_diameter"
+            )
         if self.clumps and self.clumps >= self.particles:
             _refuse("clumps", self.clumps, f"fewer than the {self.particles} particles")
 

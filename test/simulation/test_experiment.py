@@ -226,3 +226,76 @@ def test_loops_and_revolutions_without_sense_are_refused():
         revolution(small(step=0.1))
     with pytest.raises(InputError, match="fraction of 2 pi"):
         revolution(dataclasses.replace(small(), step=0.0))
+
+
+def test_a_covered_lens_shows_only_the_camera_and_the_view_comes_back():
+    experiment = Experiment(small(offset_spread_adu=0.0))
+    experiment.cover()
+    experiment.advance()
+    dark = experiment.frame()
+    assert dark.image.mean() == pytest.approx(100, abs=0.05)  # the offset; the background would add 20
+    assert dark.image.std() == pytest.approx(2 * 1.6, rel=0.05)  # read noise times gain
+    assert len(dark.truth[0].particle_id) == 12
+    assert not dark.truth[0].electrons.any()
+    experiment.cover(False)
+    experiment.advance()
+    assert experiment.frame().image.max() > 1000
+
+
+def test_a_shift_moves_image_and_truth_together():
+    still = {"play": 0.0, "play_z": 0.0, "tilt_play": 0.0, "drift_xy": 0.0, "vibration_xy": 0.0}
+    experiment = Experiment(small(optics="ideal", background=1.0, stray_particles=1, **still))
+    before = experiment.frame()
+    experiment.shift(40 * before.pixel_size, -25 * before.pixel_size)
+    after = experiment.frame()
+    for body in (0, 1):
+        moved = after.truth[body].translation - before.truth[body].translation
+        np.testing.assert_allclose(moved[:2] / before.pixel_size, (40, -25), atol=1e-6)
+    overlap = before.image[25:, :-40].astype(float), after.image[:-25, 40:].astype(float)
+    assert np.corrcoef(overlap[0].ravel(), overlap[1].ravel())[0, 1] > 0.9
+    experiment.shift(0, 0)
+    np.testing.assert_allclose(
+        experiment.frame().truth[0].translation[:2], before.truth[0].translation[:2], atol=1e-12
+    )
+
+
+def test_another_constellation_on_the_same_gear_and_back():
+    experiment, other = Experiment(small(seed=4)), Experiment(small(seed=5))
+    own = experiment.gear.particles.position
+    experiment.exchange_particles(5)
+    np.testing.assert_array_equal(experiment.gear.particles.position, other.gear.particles.position)
+    experiment.advance()
+    assert experiment.frame().truth[0].psi == experiment.gear.psi != other.gear.psi
+    experiment.exchange_particles(4)
+    np.testing.assert_array_equal(experiment.gear.particles.position, own)
+
+
+def test_the_ring_gear_is_a_second_body_that_turns_against_the_load_gear():
+    ring = {"ring_particles": 60, "ring_diameter": 125e-6, "ring_width": 40e-6, "ring_direction": 0.5}
+    settings = small(gear_x=-20e-6, gear_y=-15e-6, backlash=0.05, vibration_xy=0.0, **ring)
+    experiment = Experiment(settings)
+    start = experiment.frame()
+    assert [truth.body for truth in start.truth] == ["load_gear", "ring_gear"]
+    assert len(start.truth[1].particle_id) > 5
+    experiment.advance(3)
+    forward = experiment.frame()
+    gear, wheel = forward.truth
+    assert wheel.psi == pytest.approx(-80 / 200 * gear.psi, abs=1e-12)
+    body = experiment.ring.particles.position[wheel.particle_id]
+    np.testing.assert_allclose(wheel.position, body @ wheel.rotation.T + wheel.translation, atol=1e-15)
+    # Each within its own half of the clearance, about axes half of both diameters apart.
+    apart = np.hypot(*(wheel.translation - gear.translation)[:2])
+    assert apart == pytest.approx((125e-6 + 50e-6) / 2, abs=390e-9 + 2 * 200e-9)
+    # The drive turns the ring at once; the load gear follows when the backlash has been taken up.
+    experiment.advance(1, direction=-1)
+    gear_turned, ring_turned = (
+        after.psi - before.psi for after, before in zip(experiment.frame().truth, forward.truth, strict=True)
+    )
+    assert -ring_turned / 0.4 - gear_turned == pytest.approx(-0.05, abs=1e-12)
+
+
+def test_a_ring_gear_changes_nothing_of_the_load_gear():
+    alone, accompanied = Experiment(small()), Experiment(small(ring_particles=5))
+    for experiment in (alone, accompanied):
+        experiment.advance(2)
+    np.testing.assert_array_equal(alone.frame().truth[0].position, accompanied.frame().truth[0].position)

@@ -39,6 +39,7 @@ def test_defaults_pass_and_round_trip_through_json():
         ({"pixel_format": "mono12"}, ["pixel_format", "mono8, mono16"]),
         ({"pixel_format": "mono8"}, ["saturation_adu", "255"]),
         ({"hub_diameter": 400e-6}, ["hub_diameter", "gear_diameter"]),
+        ({"ring_diameter": 100e-6, "ring_width": 60e-6}, ["ring_width", "half of ring_diameter"]),
         ({"particles": 3, "clumps": 3}, ["clumps", "3 particles"]),
     ],
 )

@@ -15,7 +15,7 @@ from mems6dof_ros.calibration.moments import Moments, residual_moments
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
-from mems6dof_ros.localization.detection import detect
+from mems6dof_ros.localization.detection import DetectionSettings, detect
 from mems6dof_ros.localization.fitting import fit_gaussians
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
@@ -25,8 +25,10 @@ Progress = Callable[[int, int], None]
 LEAST_PLANES = 8
 #: Beads nearer to each other than this part of the window disturb each other when out of focus.
 _NEIGHBOUR = 0.75
-#: A bead must be fitted in this part of the planes, in one run through its focus.
+#: A bead must be fitted in one run through focus, at least this part of the median bead's.
 _LEAST_RUN = 0.6
+#: Least amplitude in its standard deviations, and largest sigma in windows, of a usable fit.
+_SIGNIFICANCE, _WIDEST = 8.0, 0.4
 #: Brighter or dimmer than the median bead by this factor: a clump, or debris.
 _BRIGHTNESS_FACTOR = 3.0
 #: Planes in which beads are looked for, spread over the sharpest part of the stack.
@@ -97,7 +99,7 @@ def measure_stack(
     """
     planes = list(frames)
     stage_z, pixel_size, image_size = _check_planes(planes, description or "focus stack")
-    seeds = _find_beads(planes, window_px)
+    seeds = _find_beads(planes)
     fits = _track(planes, seeds, camera, weighting, window_px, progress)
     moments = [residual_moments(p.image, f, camera, window_px) for p, f in zip(planes, fits, strict=True)]
     beads, rejected = _select(fits, moments, seeds, stage_z, window_px)
@@ -145,7 +147,7 @@ def _digest(planes: Sequence[Frame], stage_z: Array) -> str:
     return digest.hexdigest()
 
 
-def _find_beads(planes: Sequence[Frame], window_px: int) -> Array:
+def _find_beads(planes: Sequence[Frame]) -> Array:
     """Positions (n, 2) px of everything detected in a few planes about the sharpest one.
 
     Tilt and curvature put beads into focus at different planes, hence several of them.
@@ -158,7 +160,7 @@ def _find_beads(planes: Sequence[Frame], window_px: int) -> Array:
         found = detect(planes[index].image)
         if len(seeds) and len(found):
             distance, _ = cKDTree(seeds).query(found)
-            found = found[distance > window_px / 4]
+            found = found[distance > DetectionSettings().separation_px]
         seeds = np.vstack([seeds, found])
     return seeds
 
@@ -203,17 +205,19 @@ def _select(
     parameters = np.array([found.parameters for found in fits])
     flags = np.array([found.flags for found in fits])
     order = np.argsort(stage_z, kind="stable")
+    good = (flags[order] & (Flag.FIT_FAILED | Flag.WINDOW_CUT)) == 0
+    good &= np.array([_significant(found, window_px) for found in fits])[order]
+    runs = [order[_run_through_focus(parameters[order, n], good[:, n])] for n in range(len(seeds))]
+    least_run = max(LEAST_PLANES, _LEAST_RUN * float(np.median([len(run) for run in runs] or [0])))
     crowd = cKDTree(seeds).query(seeds, k=2)[0][:, 1] if len(seeds) > 1 else np.full(len(seeds), np.inf)
     beads, places, rejected = [], [], []
     for number, seed in enumerate(seeds):
-        good = (flags[order, number] & (Flag.FIT_FAILED | Flag.WINDOW_CUT)) == 0
-        run = _run_through_focus(parameters[order, number], good)
-        used = order[run]
+        used = runs[number]
         if (flags[:, number] & Flag.WINDOW_CUT).any():
             reason = "its window leaves the image"
         elif crowd[number] < _NEIGHBOUR * window_px:
             reason = f"overlaps: another particle at {crowd[number]:.0f} px"
-        elif len(used) < _LEAST_RUN * len(stage_z):
+        elif len(used) < least_run:
             reason = f"unfittable: fitted in {len(used)} of {len(stage_z)} planes in a row"
         elif (flags[used, number] & Flag.SATURATED).any():
             reason = f"saturated in {np.count_nonzero(flags[used, number] & Flag.SATURATED)} planes"
@@ -241,13 +245,18 @@ def _select(
     return tuple(keep), tuple(rejected)
 
 
+def _significant(fits: GaussianFits, window_px: int) -> NDArray[np.bool_]:
+    """Fits (n,) that stand out of the noise and are narrower than their window."""
+    with np.errstate(invalid="ignore"):
+        stands_out = fits.parameters[:, 2] > _SIGNIFICANCE * np.sqrt(fits.covariance[:, 2, 2])
+        return stands_out & (fits.parameters[:, 3:5].max(axis=1) < _WIDEST * window_px)
+
+
 def _run_through_focus(parameters: Array, good: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Indices of the unbroken run of ``good`` planes about the smallest image."""
+    """Indices of the unbroken run of ``good`` planes about the brightest image."""
     if not good.any():
         return np.empty(0, dtype=np.intp)
-    size = np.where(good, parameters[:, 3] * parameters[:, 4], np.inf)
-    # An amplitude lost in the background may be fitted by any small Gaussian: brightest counts.
-    focus = int(np.argmax(np.where(good, parameters[:, 2], -np.inf))) if np.isfinite(size).any() else 0
+    focus = int(np.argmax(np.where(good, parameters[:, 2], -np.inf)))
     bad = np.flatnonzero(~good)
     first = bad[bad < focus].max(initial=-1) + 1
     last = bad[bad > focus].min(initial=len(good))

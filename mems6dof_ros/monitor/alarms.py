@@ -23,6 +23,9 @@ QUANTITIES = (
     "particles_used",
     "latency_total",
 )
+#: An alarm ends when the value has been within its limits for so long, s: a value that swings across a
+#: limit in every cycle is one alarm and not many.
+HOLD = 2.0
 _COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 
 
@@ -30,7 +33,8 @@ _COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 class Limit:
     """Allowed range of one quantity, SI units, and how it has been kept.
 
-    ``active``: the last value is outside; ``count``: cycles outside since the limit was set.
+    ``active``: a value of the last HOLD seconds was outside; ``count``: cycles outside since the limit
+    was set.
     """
 
     quantity: str
@@ -38,6 +42,7 @@ class Limit:
     high: float
     active: bool = False
     count: int = 0
+    outside_at: float = -math.inf  # s, stamp of the last cycle outside
 
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
@@ -71,8 +76,11 @@ class Alarms:
             if math.isnan(value):
                 continue
             outside = not limit.low <= value <= limit.high
-            limit.count += outside
-            if outside != limit.active:
-                limit.active = outside
+            if outside:
+                limit.count += 1
+                limit.outside_at = row[_COLUMN["stamp"]]
+            active = outside or row[_COLUMN["stamp"]] - limit.outside_at < HOLD
+            if active != limit.active:
+                limit.active = active
                 changed.append((limit, value))
         return changed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -129,7 +130,16 @@ class Feed:
                     {"name": name, "number": number, **asdict(self._tracking[name])}
                     for name, number in self.bodies.items()
                 ],
-                "limits": [_finite(asdict(limit)) for limit in self._alarms.limits.values()],
+                "limits": [
+                    {
+                        "quantity": limit.quantity,
+                        "low": _finite(limit.low),
+                        "high": _finite(limit.high),
+                        "active": limit.active,
+                        "count": limit.count,
+                    }
+                    for limit in self._alarms.limits.values()
+                ],
             }
 
     def set_limit(self, limit: Limit) -> None:
@@ -170,9 +180,9 @@ class Feed:
             self._log(text)
             self.tell("alarm", text)
         else:
-            self.tell("good", f"{text}, within its limits again")
+            self.tell("good", f"{text}, within its limits again after {limit.count} cycles outside")
 
 
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
+def _finite(bound: float) -> float | None:
     """JSON knows no infinity: an open limit is None."""
-    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in values.items()}
+    return bound if math.isfinite(bound) else None

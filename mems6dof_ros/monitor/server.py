@@ -16,6 +16,7 @@ import asyncio
 import json
 import logging
 import math
+import os
 import struct
 import threading
 import time
@@ -124,9 +125,9 @@ class MonitorServer:
         except OSError as error:
             await runner.cleanup()
             where = f"address {self._address}, port {self._port}"
-            self._url.set_exception(
-                InputError(where, error.strerror or str(error), "an address and port free here")
-            )
+            # asyncio wraps the reason in a sentence of its own, so the plain one comes from the number.
+            reason = os.strerror(error.errno).lower() if (error.errno or 0) > 0 else str(error)
+            self._url.set_exception(InputError(where, reason, "an address and port free here"))
             return
         self._loop = asyncio.get_running_loop()
         host, port, *_ = runner.addresses[0]

@@ -60,7 +60,7 @@ SERVICES = (
 TOKEN_VARIABLE = "MEMS6DOF_MONITOR_TOKEN"
 
 _RATES = (topics.FRAME_INFO, topics.LOCALIZATIONS, topics.POSE_6DOF)
-_MEMORY_FRAMES = 64  # frames whose messages are kept until the picture of one of them is made
+_MEMORY_FRAMES = 256  # frames whose messages are kept until the picture of one of them is made
 _STATE_PERIOD = 0.5  # s
 _PICTURE_PATIENCE = 0.5  # s that a picture waits for its pose
 _STANDSTILL = 10.0  # s without a frame after which none are expected

@@ -67,9 +67,13 @@ def test_history_keeps_the_last_rows_and_skips_what_is_gone():
 def test_alarm_begins_and_ends_once_and_counts_every_cycle_outside():
     alarms = Alarms()
     alarms.set(Limit("tilt_x", -1e-3, 1e-3))
-    values = [0, 1e-3, 1.1e-3, math.nan, -2e-3, 0.5e-3, 0.2e-3]
-    changes = [[value for _, value in alarms.judge(row(tilt_x=value))] for value in values]
-    assert changes == [[], [], [1.1e-3], [], [], [0.5e-3], []]
+    values = [0, 1e-3, 1.1e-3, math.nan, 0.5e-3, -2e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.3e-3]
+    changes = [
+        [value for _, value in alarms.judge(row(tilt_x=value, stamp=100 + 0.9 * number))]
+        for number, value in enumerate(values)
+    ]
+    # Ended two seconds after the last value outside, the sixth.
+    assert changes == [[], [], [1.1e-3], [], [], [], [], [], [0.1e-3], []]
     assert alarms.limits["tilt_x"].count == 2
     alarms.remove("tilt_x")
     assert alarms.judge(row(tilt_x=1.0)) == []

@@ -116,7 +116,7 @@ export class CycleChart {
     this.plot = new uPlot({
       ...this.size(),
       legend: { show: false },
-      padding: [6, 10, 0, 0],
+      padding: [6, 16, 0, 0],
       cursor: {
         sync: { key: "cycles", scales: ["x", null] }, y: false, drag: { x: true, y: false, setScale: false },
         points: { size: 6 },

@@ -89,10 +89,14 @@ const micrograph = new Micrograph($("micrograph-canvas"), $("tooltip"), $("pictu
 const charts = [...document.querySelectorAll(".chart")].map((root) => new CycleChart(root, view, freeze, follow));
 const maps = [
   new PathMap($("centre-map"), "Path of the centre", ["dx", "dy"], view, (history, row) =>
-    `${number(1e9 * Math.hypot(history.columns.dx[row], history.columns.dy[row]), 1)} nm from the reference`),
+    `${number(1e9 * Math.hypot(history.columns.dx[row], history.columns.dy[row]), 1)} nm from zero`),
   new PathMap($("axis-map"), "Path of the axis", ["tilt_x", "tilt_y"], view, (history, row) => {
-    const figure = (key) => number(history.columns[key][row] * QUANTITIES[key].scale, QUANTITIES[key].digits);
-    return `β ${figure("beta")} mrad, α ${figure("alpha")}°`;
+    const figure = (key) => {
+      const { label, scale, digits, unit } = QUANTITIES[key];
+      const value = history.columns[key][row] * scale;
+      return Number.isNaN(value) ? `${label} undetermined` : `${label} ${number(value, digits)} ${unit}`;
+    };
+    return `${figure("beta")}, ${figure("alpha")}`;
   }),
 ];
 
@@ -102,7 +106,8 @@ function chooseRange() {
     [view.low, view.high] = frozen;
   } else if (history?.length) {
     view.high = history.last("cycle");
-    view.low = window_ ? view.high - window_ + 1 : history.cycle[history.first];
+    const first = history.cycle[history.first];
+    view.low = window_ ? Math.max(view.high - window_ + 1, first) : first;
   }
 }
 
@@ -235,4 +240,4 @@ setWindow(window_);
 requestAnimationFrame(tick);
 
 // For the browser test, which asks whether things move.
-window.mems6dof = { link, micrograph, view };
+window.mems6dof = { charts, link, micrograph, view };

@@ -98,7 +98,7 @@ export class PathMap {
     ctx.strokeStyle = colour("neutral");
     const pieces = 24, count = Math.max(last - first, 1);
     for (let p = 0; p < pieces; p++) {  // older is fainter
-      ctx.globalAlpha = 0.10 + 0.6 * ((p + 1) / pieces) ** 2;
+      ctx.globalAlpha = 0.06 + 0.34 * ((p + 1) / pieces) ** 2;
       ctx.beginPath();
       let down = false;
       const end = first + Math.ceil((p + 1) * count / pieces);

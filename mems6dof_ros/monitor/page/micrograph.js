@@ -34,6 +34,7 @@ export class Micrograph {
     // Without an image its size is unknown: the last one's, or the usual sensor's.
     overlay.width ??= this.overlay?.width ?? 2048;
     overlay.height ??= this.overlay?.height ?? 2048;
+    overlay.pixel_size ??= this.overlay?.pixel_size;
     this.overlay = overlay;
     const grey = overlay.grey ? `, grey ${overlay.grey.map((g) => Math.round(g)).join(" to ")} ADU` : ", no image received";
     this.caption.textContent = `cycle ${overlay.cycle}${grey}`;

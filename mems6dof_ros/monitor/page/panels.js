@@ -131,7 +131,7 @@ export function showLimits(limits, remove) {
     const { name, unit, scale, digits } = QUANTITIES[limit.quantity];
     const bound = (v, open) => v === null ? open : number(v * scale, Math.min(digits, 3));
     const range = `${bound(limit.low, "any")} to ${bound(limit.high, "any")} ${unit}`;
-    const state = limit.active ? "OUTSIDE NOW" : limit.count ? "within again" : "kept";
+    const state = limit.active ? "ALARM" : limit.count ? "within again" : "kept";
     const count = limit.count ? `, ${limit.count} cycle${limit.count > 1 ? "s" : ""} outside` : "";
     const button = element("button", "", "×");
     button.title = "Remove this limit";

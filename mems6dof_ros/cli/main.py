@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "cameras": "mems6dof_ros.cli.cameras",
     "validate": {
         "localization": "mems6dof_ros.cli.validate_localization",
+        "cameras": "mems6dof_ros.cli.validate_cameras",
     },
 }
 

@@ -60,9 +60,15 @@ class AravisDevice:
     def __init__(self, settings: CameraSettings) -> None:
         aravis, error = _aravis()
         name = choose_camera(list_cameras(), settings.device).device
+        self._buffers = settings.buffers
+        self._stream: Any = None
+        self._answers = True
         try:
             self._camera = aravis.Camera.new(name)
-            self._device = self._camera.get_device()
+        except error as problem:
+            raise CameraLostError(f"camera {name}: {problem.message}") from None
+        self._device = self._camera.get_device()
+        try:
             self._state = apply_settings(_AravisFeatures(self._device), settings, name)
             if self._camera.is_gv_device():
                 if settings.packet_size:
@@ -70,10 +76,11 @@ class AravisDevice:
                 else:
                     self._camera.gv_auto_packet_size()
         except error as problem:
+            self.close()
             raise CameraLostError(f"camera {name}: {problem.message}") from None
-        self._buffers = settings.buffers
-        self._stream: Any = None
-        self._answers = True
+        except Exception:
+            self.close()
+            raise
 
     @property
     def state(self) -> DeviceState:
@@ -118,10 +125,12 @@ class AravisDevice:
         return True
 
     def close(self) -> None:
-        if self._stream is not None and self._answers:
-            with suppress(_aravis()[1]):  # it is gone: nothing is left to stop
+        with suppress(_aravis()[1]):  # it may be gone: nothing is left to stop
+            if self._answers and self._stream is not None:
                 self._camera.stop_acquisition()
-        self._stream = self._camera = self._device = None  # the last reference frees the camera for others
+            if self._answers and self._camera.is_gv_device():
+                self._device.leave_control()
+        self._stream = None
 
     def _ask(self, function: Any, *arguments: Any) -> Any:
         try:

@@ -8,6 +8,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import median
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.frame import NAN, Frame
@@ -81,7 +83,7 @@ class CameraSource:
             connected=self._device is not None,
             delivered=self._delivered,
             lost=self._lost,
-            pending=self._written_off,
+            pending=self._written_off + self._incomplete_since,
             incomplete=self._incomplete,
             reconnects=self._reconnects,
             clock_drift=self._clock.drift,
@@ -129,13 +131,13 @@ class CameraSource:
         self._delivered = self._lost = self._incomplete = self._reconnects = 0
         self._count, self._last_stamp_ns = -1, 0
         self._lost_at: float | None = None
-        self._recent: deque[tuple[int, int]] = deque(maxlen=32)  # count and stamp, ns
+        self._recent: deque[tuple[int, int]] = deque(maxlen=32)  # count and time, ns
         self._expect_new_device()
 
     def _expect_new_device(self) -> None:
         """Its counter and clock begin anew, and what was asked of the old one is void."""
         self._counter, self._clock, self._has_clock = FrameCounter(), DeviceClock(), False
-        self._unanswered = self._written_off = 0
+        self._unanswered = self._written_off = self._incomplete_since = 0
         self._answers = False
         self._next_trigger = 0.0
         self._quiet_since: float | None = None
@@ -164,6 +166,7 @@ class CameraSource:
         self._quiet_since = None
         if raw.data is None:
             self._incomplete += 1
+            self._incomplete_since += 1
             return None
         advance = 1 if raw.counter is None else self._counter.advance(raw.counter)
         if advance == 0:
@@ -176,12 +179,12 @@ class CameraSource:
         elif self._settings.trigger == "software":
             advance = max(advance, 1 + self._written_off)
         self._unanswered = max(self._unanswered + self._written_off - advance, 0)
-        self._written_off, self._answers = 0, True
+        self._written_off, self._incomplete_since, self._answers = 0, 0, True
         self._delivered += 1
         self._lost += advance - 1
         self._count += advance
         self._last_stamp_ns = stamp_ns
-        self._recent.append((self._count, stamp_ns))
+        self._recent.append((self._count, raw.device_time_ns or stamp_ns))
         return Frame(
             image=image,
             stamp_ns=stamp_ns,
@@ -223,8 +226,7 @@ class CameraSource:
         """Of the last frames, s; as set where there are none."""
         if len(self._recent) < 2:
             return 1 / self._state.frame_rate
-        (first, began), (last, ended) = self._recent[0], self._recent[-1]
-        return (ended - began) * 1e-9 / (last - first)
+        return 1e-9 * median((t1 - t0) / (n1 - n0) for (n0, t0), (n1, t1) in pairwise(self._recent))
 
     # Losing the camera and coming back
 

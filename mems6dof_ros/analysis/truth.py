@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import GroundTruth
 from mems6dof_ros.pose.cycle_pose import DEGREES_OF_FREEDOM, CyclePose
-from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, exp_so3, log_so3
+from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, exp_so3, lever_jacobian, log_so3
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ def _fit_constants(
             turned = microscope.rotation @ truth.rotation
             jacobian[:3, at : at + 3] = jacobian[3:, at + 3 : at + 6] = turned
             if fit_microscope:
-                jacobian[:, :6] = np.eye(6)  # turns about the centre of the field, where t is small
+                jacobian[:, :6] = lever_jacobian(microscope.rotation @ truth.translation)
             weighted = weight @ jacobian
             normal += jacobian.T @ weighted
             right += weighted.T @ _pose_error(pose, truth, microscope, bodies[pose.reference_version])

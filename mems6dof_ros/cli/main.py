@@ -24,6 +24,8 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "cameras": "mems6dof_ros.cli.cameras",
     "validate": {
         "localization": "mems6dof_ros.cli.validate_localization",
+        "calibration": "mems6dof_ros.cli.validate_calibration",
+        "pose": "mems6dof_ros.cli.validate_pose",
         "cameras": "mems6dof_ros.cli.validate_cameras",
     },
 }

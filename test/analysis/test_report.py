@@ -76,7 +76,7 @@ def test_the_page_needs_nothing_else_and_shows_every_figure(bag, tmp_path):
         assert image.std() > 5  # something is drawn
     assert "24 tracking" in page
     assert "rms error" in page
-    assert "24 frames, none lost" in page
+    assert "24 frames recorded, none reported lost" in page
     assert {"cycles.csv", "localizations.csv"} <= {file.name for file in (tmp_path / "report").iterdir()}
 
 

@@ -7,6 +7,7 @@ finds particles in focus, the larger what defocus has spread.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -15,12 +16,20 @@ from scipy.spatial import cKDTree
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import check_image
-from mems6dof_ros.localization import kernels
+from mems6dof_ros.localization import detection_kernels
+from mems6dof_ros.localization.kernels import pixels
+
+Cells: TypeAlias = NDArray[np.float32]
 
 #: Median absolute deviation to standard deviation of a normal distribution.
 _MAD_TO_SD = 1.4826
 #: Mean absolute deviation likewise.
 _MEAN_TO_SD = 1.2533
+
+#: Cells below this many standard deviations of the background are debris.
+_DARK = -3.0
+#: Standard deviation of a spot, in cells, down to which cells may be merged.
+_FINE = 1.25
 
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
@@ -67,8 +76,7 @@ def detect(image: NDArray[np.generic], settings: DetectionSettings | None = None
     if min(cells.shape) < 3:
         return np.empty((0, 2))
     score = _score(cells, settings)
-    highest = cv2.dilate(score, _NEIGHBOURS)
-    rows, columns = np.nonzero((score == highest) & (score > settings.threshold))
+    rows, columns = detection_kernels.peaks(score, settings.threshold).T
     order = np.argsort(-score[rows, columns], kind="stable")
     rows, columns = rows[order], columns[order]
     positions = np.stack(
@@ -78,46 +86,65 @@ def detect(image: NDArray[np.generic], settings: DetectionSettings | None = None
     return positions[_separated(positions, settings.separation_px)]
 
 
-def _bin(image: NDArray[np.generic], binning: int) -> NDArray[np.float32]:
+def _bin(image: NDArray[np.generic], binning: int) -> Cells:
     """Means over cells of ``binning`` px. (OpenCV would round them to the type of the pixels.)"""
     cells = np.empty([n // binning for n in image.shape], np.float32)
-    kernels.bin_cells(kernels.pixels(image), binning, cells)
+    detection_kernels.bin_cells(pixels(image), binning, cells)
     return cells
 
 
-def _score(cells: NDArray[np.float32], settings: DetectionSettings) -> NDArray[np.float32]:
+def _score(cells: Cells, settings: DetectionSettings) -> Cells:
     """Contrast of spots in standard deviations of the background, the best of all sizes."""
     size = settings.background_px // settings.binning
-    flat = cells - _typical(cells, size)
+    shape = cells.shape
+    background = _resize(_typical(cells, size), shape)
     # Noise grows with the background. The floor, far below one count, keeps rounding from becoming contrast.
-    noise = _MEAN_TO_SD * _typical(np.abs(flat), size)
-    flat /= np.maximum(noise, max(0.3 * float(np.median(noise)), 0.01))
+    noise = _MEAN_TO_SD * _typical(np.abs(cells - background), size)
+    noise = np.maximum(noise, np.float32(max(0.3 * float(np.median(noise)), 0.01)))
+    flat, debris = np.empty_like(cells), np.empty(shape, np.uint8)
     # Dark debris, edges and all, becomes background: filtered, its rim would look like bright spots.
-    debris = cv2.dilate((flat < -3).astype(np.uint8), _NEIGHBOURS)
-    flat[(debris > 0) & (flat < 0)] = 0
-    best = np.zeros_like(flat)
+    if detection_kernels.normalise(cells, background, _resize(noise, shape), _DARK, flat, debris):
+        detection_kernels.fill(cv2.dilate(debris, _NEIGHBOURS), flat)
+    best: Cells | None = None
     for sigma in settings.spot_sigmas_px:
-        narrow = max(sigma / settings.binning, 0.5)
-        response = _blur(flat, narrow) - _blur(flat, 2 * narrow)
-        np.maximum(best, response / max(_deviation(response), 0.01), out=best)
+        response = _response(flat, sigma / settings.binning)
+        best = response if best is None else np.maximum(best, response, out=best)
+    assert best is not None
     return best
 
 
-def _typical(cells: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Median over about ``size`` cells, of means over a fifth of it."""
-    height, width = cells.shape
-    coarse = (max(round(5 * width / size), 1), max(round(5 * height / size), 1))
-    medians = cv2.medianBlur(cv2.resize(cells, coarse, interpolation=cv2.INTER_AREA), 5)
-    return np.asarray(cv2.resize(medians, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+def _response(flat: Cells, sigma: float) -> Cells:
+    """Difference of Gaussians of ``sigma`` and 2 ``sigma`` cells, in its own robust standard deviations."""
+    # Large spots need no small cells.
+    coarse = max(int(sigma / _FINE), 1)
+    smaller = _resize(flat, tuple(max(round(n / coarse), 1) for n in flat.shape))
+    sigma = max(sigma / coarse, 0.5)
+    response = _blur(smaller, sigma) - _blur(smaller, 2 * sigma)
+    response *= 1 / max(_deviation(response), 0.01)
+    return _resize(response, flat.shape)
 
 
-def _blur(cells: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+def _typical(cells: Cells, size: int) -> Cells:
+    """Median over about ``size`` cells, of means over a fifth of it: one value for each of the latter."""
+    coarse = tuple(max(round(5 * n / size), 1) for n in cells.shape)
+    return np.asarray(cv2.medianBlur(_resize(cells, coarse), 5), np.float32)
+
+
+def _resize(cells: Cells, shape: tuple[int, ...]) -> Cells:
+    """Means where ``shape`` is coarser, linear interpolation where it is finer."""
+    if cells.shape == shape:
+        return cells
+    interpolation = cv2.INTER_AREA if shape[0] < cells.shape[0] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(cells, shape[::-1], interpolation=interpolation), np.float32)
+
+
+def _blur(cells: Cells, sigma: float) -> Cells:
     size = 2 * int(np.ceil(2.5 * sigma)) + 1
     blurred = cv2.GaussianBlur(cells, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
     return np.asarray(blurred, dtype=np.float32)
 
 
-def _deviation(cells: NDArray[np.float32]) -> float:
+def _deviation(cells: Cells) -> float:
     """Robust standard deviation, from a sixteenth of the cells."""
     sample = cells[::4, ::4]
     return _MAD_TO_SD * float(np.median(np.abs(sample - np.median(sample))))

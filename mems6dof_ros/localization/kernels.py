@@ -1,4 +1,4 @@
-"""Compiled kernels of detection and fit: numbers in, numbers out, nothing else of the project inside.
+"""Compiled kernels of the fit: numbers in, numbers out, nothing else of the project inside.
 
 All kernels release the GIL (threads over frames) and are cached on disk. Arguments of ``fit_windows``:
 
@@ -53,7 +53,6 @@ MOST_WINDOWS, MOST_OFF_CENTRE = 6, 1.0  # times a window is placed; px from part
 
 Array: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.generic]
-FloatImage: TypeAlias = NDArray[np.float32]
 
 # Sums may be reordered (vectors); only where no NaN or infinity can come may the compiler exclude them.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -597,23 +596,6 @@ def _uncertainty(
         for j in range(7):
             covariance[i, j] *= scale[i] * scale[j]
     return chi / max(pixels - 7, 1.0)
-
-
-@njit(fastmath=_FAST, **_OPTIONS)
-def bin_cells(image: Image, binning: int, cells: FloatImage) -> None:
-    """``cells``: means over squares of ``binning`` px; lines that do not fill one are left out."""
-    rows, columns = cells.shape
-    sums = np.empty(columns * binning, np.float32)
-    for i in range(rows):
-        sums[:] = 0.0
-        for k in range(i * binning, (i + 1) * binning):
-            for j in range(sums.size):
-                sums[j] += np.float32(image[k, j])
-        for j in range(columns):
-            s = np.float32(0.0)
-            for k in range(j * binning, (j + 1) * binning):
-                s += sums[k]
-            cells[i, j] = s / np.float32(binning * binning)
 
 
 @njit(**_OPTIONS)

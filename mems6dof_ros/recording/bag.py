@@ -116,7 +116,8 @@ class BagWriter:
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file's content, for instance the calibration, to this and all later files."""
         self._attachments.append((name, data, media_type))
-        self._files[-1].attach(name, data, media_type)
+        with self._saving_what_is_whole():
+            self._files[-1].attach(name, data, media_type)
 
     def flush(self) -> None:
         """Hand everything to the operating system, and to the disk once per ``sync_period``."""

@@ -95,7 +95,7 @@ class ImagesSource:
         )
 
     def stop(self) -> None:
-        pass  # files are opened for each image
+        pass  # the files stay open for the next start
 
     def _read_image(self, k: int) -> Pixels:
         image = self._load(k)

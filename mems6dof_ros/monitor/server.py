@@ -126,7 +126,8 @@ class MonitorServer:
             await runner.cleanup()
             where = f"address {self._address}, port {self._port}"
             # asyncio wraps the reason in a sentence of its own, so the plain one comes from the number.
-            reason = os.strerror(error.errno).lower() if (error.errno or 0) > 0 else str(error)
+            number = error.errno or 0
+            reason = os.strerror(number).lower() if number > 0 else str(error)
             self._url.set_exception(InputError(where, reason, "an address and port free here"))
             return
         self._loop = asyncio.get_running_loop()

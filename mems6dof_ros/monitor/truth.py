@@ -26,6 +26,7 @@ class TruthAlignment:
         self.cycles: list[int] = []
         self._rotations = np.zeros((3, 3))
         self._translations = np.zeros(3)
+        self._own_body: RigidPose | None = None  # to the true one
 
     def add(self, pose: CyclePose, truth: GroundTruth) -> NDArray[np.float64] | None:
         """True displacement (6,) of ``pose``, m and rad, in the order of DEGREES_OF_FREEDOM.
@@ -33,15 +34,17 @@ class TruthAlignment:
         None until enough pairs have been added.
         """
         true = RigidPose(truth.rotation, truth.translation)
-        if len(self.cycles) < self.CYCLES:
+        if self._own_body is None:
             between = RigidPose(pose.rotation, pose.translation).then(true.inverse())
             self._rotations += between.rotation
             self._translations += between.translation
             self.cycles.append(pose.cycle)
+            if len(self.cycles) == self.CYCLES:
+                # The rotation nearest to the mean matrix (Moakher 2002, the mean in the Frobenius metric).
+                u, _, vt = np.linalg.svd(self._rotations)
+                self._own_body = RigidPose(u @ vt, self._translations / self.CYCLES)
             return None
-        # The rotation nearest to the mean matrix (Moakher 2002, the mean in the Frobenius metric).
-        u, _, vt = np.linalg.svd(self._rotations)
-        own = RigidPose(u @ vt, self._translations / len(self.cycles)).then(true)
+        own = self._own_body.then(true)
         reference = pose.translation - pose.displacement[:3]
         tilt_x, tilt_y, psi = swing_twist(own.rotation)
         psi = unwrap_near(psi, pose.displacement[5])

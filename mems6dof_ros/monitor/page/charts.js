@@ -1,7 +1,7 @@
 // One quantity against motion cycle: line, uncertainty band, truth, limits, lost cycles.
 
 import uPlot from "./vendor/uPlot.esm.js";
-import { QUANTITIES, colour, font, number, uncertain } from "./quantities.js";
+import { QUANTITIES, colour, decimals, font, number, uncertain } from "./quantities.js";
 
 const BAND_SD = 2;
 
@@ -128,7 +128,7 @@ export class CycleChart {
           values: (_, ticks) => ticks.map((t) => (Number.isInteger(t) && LABELLED.includes(this.key) ? t : "")) },
         { ...axis, size: Math.round(size * 2.6), space: 17,
           values: (_, ticks, __, ___, step) =>
-            ticks.map((t) => number(t, Math.min(Math.max(-Math.floor(Math.log10(step) + 1e-9), 0), 7))) },
+            ticks.map((t) => number(t, decimals(step))) },
       ],
       series: [
         {},

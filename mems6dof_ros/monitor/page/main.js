@@ -94,7 +94,7 @@ const maps = [
     const figure = (key) => {
       const { label, scale, digits, unit } = QUANTITIES[key];
       const value = history.columns[key][row] * scale;
-      return Number.isNaN(value) ? `${label} undetermined` : `${label} ${number(value, digits)} ${unit}`;
+      return Number.isNaN(value) ? `${label} undetermined` : `${label} ${number(value, digits)}${unit === "°" ? "" : " "}${unit}`;
     };
     return `${figure("beta")}, ${figure("alpha")}`;
   }),

@@ -1,6 +1,6 @@
 // The path of two quantities against each other, to scale: the centre, or the axis.
 
-import { QUANTITIES, colour, font, niceStep, number } from "./quantities.js";
+import { QUANTITIES, colour, decimals, font, niceStep, number } from "./quantities.js";
 
 const MAX_POINTS = 3000;
 
@@ -58,7 +58,7 @@ export class PathMap {
     const py = (v) => box.y + box.h / 2 + (v - cy) * b.scale / this.unit;
 
     const step = niceStep(Math.min(box.w, box.h) * this.unit, 3.2);
-    const digits = Math.max(-Math.floor(Math.log10(step) + 1e-9), 0);
+    const digits = decimals(step);
     ctx.font = font();
     ctx.fillStyle = colour("muted");
     ctx.lineWidth = 1;

@@ -52,6 +52,13 @@ export function niceStep(span, count) {
   return [1, 2, 5, 10].find((f) => f * power >= raw * 0.999) * power;
 }
 
+// Decimals that tell multiples of `step` apart and exactly.
+export function decimals(step) {
+  let digits = 0;
+  while (digits < 9 && Math.abs(Math.round(step * 10 ** digits) - step * 10 ** digits) > 1e-6 * step * 10 ** digits) digits++;
+  return digits;
+}
+
 let colours = {};
 export function readColours() {
   const style = getComputedStyle(document.documentElement);

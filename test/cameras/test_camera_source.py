@@ -242,3 +242,20 @@ def test_start_begins_again_and_stop_ends():
 def test_settings_are_refused_with_their_reason(options, complaint):
     with pytest.raises(InputError, match=complaint):
         parse_settings(options)
+
+
+def test_a_frame_of_the_wrong_size_is_refused_and_lost():
+    source, _ = source_of([1, 2, 3])
+    device = source._device
+    grab = device.grab
+
+    def cut_the_second(timeout):
+        raw = grab(timeout)
+        return replace(raw, data=raw.data[:-1]) if raw and raw.counter == 2 else raw
+
+    device.grab = cut_the_second
+    assert source.read().frame_counter == 0
+    with pytest.raises(InputError, match="camera frame: found 15 bytes; expected 16 for 4 x 2 Mono16"):
+        source.read()
+    frame = source.read()
+    assert (frame.frame_counter, frame.frames_dropped) == (2, 1)

@@ -31,7 +31,7 @@ _TRIGGERS_AHEAD = 3
 
 @dataclass(frozen=True)
 class CameraStatus:
-    """Health of a live camera, for diagnostics.
+    """Health of a live camera, for diagnostics; may be asked for from any thread.
 
     ``delivered``, ``lost``: frames since start; every frame that the device is known to have produced is in
     one of them, or among the ``pending``: noticed as missing but not yet reported with a frame.
@@ -168,11 +168,11 @@ class CameraSource:
             self._incomplete += 1
             self._incomplete_since += 1
             return None
+        state = self._state
+        image = decode(raw.data, state.pixel_format, state.width, state.height)
         advance = 1 if raw.counter is None else self._counter.advance(raw.counter)
         if advance == 0:
             return None
-        state = self._state
-        image = decode(raw.data, state.pixel_format, state.width, state.height)
         stamp_ns = max(self._stamp(raw), self._last_stamp_ns + 1)
         if self._lost_at is not None:
             advance = self._come_back(stamp_ns)
@@ -226,7 +226,7 @@ class CameraSource:
         """Of the last frames, s; as set where there are none."""
         if len(self._recent) < 2:
             return 1 / self._state.frame_rate
-        return 1e-9 * median((t1 - t0) / (n1 - n0) for (n0, t0), (n1, t1) in pairwise(self._recent))
+        return 1e-9 * median((t1 - t0) / (n1 - n0) for (n0, t0), (n1, t1) in pairwise(tuple(self._recent)))
 
     # Losing the camera and coming back
 

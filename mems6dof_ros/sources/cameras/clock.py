@@ -52,7 +52,7 @@ class DeviceClock:
         One bin's quickest arrival is off by that much, the line through many of them by less. What delays
         every message alike is not in it, for no arrival tells. NaN before the first second.
         """
-        heights = sorted(self._height(b) for b in self._bins)
+        heights = sorted(self._height(b) for b in tuple(self._bins))  # asked by other threads
         return heights[len(heights) // 2] * 1e-9 if len(heights) >= 4 else NAN
 
     def add(self, device_ns: int, host_ns: int) -> None:

@@ -140,7 +140,7 @@ def apply_settings(features: Features, settings: CameraSettings, name: str) -> D
         exposure=_read_number(features, *_EXPOSURE[1:]),
         frame_rate=settings.frame_rate
         if settings.triggered
-        else _read_number(features, (*_RESULTING_RATE, *_FRAME_RATE[1]), 1.0),
+        else _read_number(features, (*_RESULTING_RATE, *_FRAME_RATE[1]), 1.0) or NAN,
     )
 
 

@@ -36,6 +36,7 @@ setup(
             "localizer = mems6dof_ros.nodes.localizer:main",
             "pose_estimator = mems6dof_ros.nodes.pose_estimator:main",
             "recorder = mems6dof_ros.nodes.recorder:main",
+            "controller = mems6dof_ros.nodes.controller:main",
             "monitor = mems6dof_ros.nodes.monitor:main",
             "foxglove_bridge = mems6dof_ros.nodes.foxglove_bridge:main",
         ],

@@ -36,7 +36,12 @@ class ControllerSettings:
 
     frequency: float = _field(90.0, "Hz", 1e-3, 1e4, "Motion cycles per second.")
     max_play: float = _field(
-        1e-6, "m", 0.0, 1e-3, "Largest displacement in x and y, once the centre of rotation is known."
+        3e-6,
+        "m",
+        0.0,
+        1e-3,
+        "Largest displacement in x and y, from reference version 2 on, whose origin is near the centre of"
+        " rotation; after a whole revolution it is known well enough for 1e-6.",
     )
     max_tilt: float = _field(5e-3, "rad", 0.0, 1.0, "Largest tilt from the reference.")
     max_sd_psi: float = _field(0.5e-3, "rad", 0.0, 1.0, "Largest standard deviation of psi to act on.")

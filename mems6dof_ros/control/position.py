@@ -88,8 +88,8 @@ class PositionLaw:
 
 
 class DriveModel:
-    """A cycle at relative amplitude a turns the gear by gain (a - stiction)/(1 - stiction), less the slack that
-    it takes up first. Gain, stiction and backlash are means of what the latest cycles showed."""
+    """A cycle at relative amplitude a turns the gear by gain (a - stiction)/(1 - stiction), less the slack
+    that it takes up first. Gain, stiction and backlash are means of what the latest cycles showed."""
 
     MEMORY = 10  # observations after which older ones are forgotten
 

@@ -8,7 +8,7 @@
                  ENDED ──▶ exit, or ~/start to begin again
 
 Topics (relative): ``frame_info``, ``truth`` where the source knows it, ``camera_info``, and then
-``image_raw``, all with one header.
+``image_raw``, all with one header. With ``simulator.commanded`` also those of ``nodes.actuation``.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.actuation import serve_commanded_simulator
 from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter, of_settings
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
+from mems6dof_ros.sources.simulator import CommandedSimulator
 from mems6dof_ros.sources.source import SOURCES, open_source
 
 #: What tells that a frame has been dealt with, and its type.
@@ -82,6 +84,11 @@ PARAMETERS = (
         "at_end", "exit", "What to do after the last frame of a finite source.", choices=("exit", "idle")
     ),
     replace(WAIT_PARAMETER, default=(f"{topics.IMAGE}:1",)),
+    Parameter(
+        "simulator.commanded",
+        False,
+        "The gear turns only as actuation_command asks, a frame for each motion cycle; use with rate 0.0.",
+    ),
     Parameter("simulator.cycles", 0, "Motion cycles to simulate; 0: no end.", "cycles", (0, 2**31 - 1)),
     Parameter(
         "simulator.loop",
@@ -149,6 +156,8 @@ class FrameSourceNode(InstrumentNode):
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_service(Trigger, "~/step", self._on_step)
+        if isinstance(self._source, CommandedSimulator):
+            serve_commanded_simulator(self, self._source)
         self.health.gauge("frames in flight", lambda: len(self._in_flight))
         info = self._source.info
         self.get_logger().info(

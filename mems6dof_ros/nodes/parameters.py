@@ -35,7 +35,15 @@ from rclpy.parameter import Parameter as RosParameter
 from mems6dof_ros.errors import InputError
 
 #: The nodes with a table ``PARAMETERS``.
-NODES = ("frame_source", "localizer", "pose_estimator", "recorder", "monitor", "foxglove_bridge")
+NODES = (
+    "frame_source",
+    "localizer",
+    "pose_estimator",
+    "recorder",
+    "controller",
+    "monitor",
+    "foxglove_bridge",
+)
 
 Value = bool | int | float | str | Sequence[Any]
 Settings = TypeVar("Settings")

@@ -40,6 +40,10 @@ KNOWN_TYPES = {
     topics.POSE_6DOF: "mems6dof_msgs/msg/Pose6DOF",
     topics.POSE: "geometry_msgs/msg/PoseStamped",
     topics.POSE_WITH_COVARIANCE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    topics.PSI_TARGET: "std_msgs/msg/Float64",
+    topics.ACTUATION_COMMAND: "mems6dof_msgs/msg/ActuationCommand",
+    topics.ACTUATION_ACKNOWLEDGEMENT: "mems6dof_msgs/msg/ActuationAcknowledgement",
+    topics.CONTROLLER_STATE: "mems6dof_msgs/msg/ControllerState",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 #: Recorded unless asked otherwise: everything but the images, which need the disk's own rate.

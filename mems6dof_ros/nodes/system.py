@@ -37,6 +37,7 @@ _PUBLISHED = {
 _SUBSCRIBED = {
     "localizer": (topics.IMAGE, topics.FRAME_INFO),
     "pose_estimator": (topics.LOCALIZATIONS,),
+    "controller": (topics.POSE_6DOF,),
 }
 
 
@@ -82,17 +83,22 @@ def chain(
     image_topic: str = topics.IMAGE,
     recorded: Sequence[str] = DEFAULT_TOPICS,
     compression: str = "none",
+    controller: NodeSpec | None = None,
+    watched: Sequence[str] = (),
 ) -> list[NodeSpec]:
-    """frame_source, localizer, pose_estimator and, with an ``output``, recorder.
+    """frame_source, localizer, pose_estimator, ``controller`` if any and, with an ``output``, recorder.
 
     ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for
-    the subscribers that the table gives it, so that nothing is lost at the beginning.
+    the subscribers that the table gives it, and for one more of each topic in ``watched``, so that nothing is
+    lost at the beginning.
     """
     queue = {"queue_policy": queue_policy}
     remap = {topics.IMAGE: image_topic} if image_topic != topics.IMAGE else {}
     nodes = [source] if source else []
     nodes.append(NodeSpec("localizer", {"calibration": calibration, **queue}, remap))
     nodes.append(NodeSpec("pose_estimator", queue))
+    if controller:
+        nodes.append(controller)
     if output:
         attachments = {"attachments": [calibration]} if calibration else {}
         recorder = {
@@ -102,13 +108,23 @@ def chain(
             **attachments,
         }
         nodes.append(NodeSpec("recorder", recorder, remap))
-    return [_waiting_for_subscribers(node, nodes) for node in nodes]
+    subscribed = [*watched, *(topic for node in nodes for topic in _subscriptions(node))]
+    return [_waiting_for_subscribers(node, subscribed) for node in nodes]
 
 
 def simulated(cycles: int, **settings: Any) -> NodeSpec:
     """A frame_source that simulates ``cycles`` and ends when all of them have become poses."""
     options = {f"simulator.{name}": value for name, value in settings.items()}
     return _finite("simulator", {"simulator.cycles": cycles, **options})
+
+
+def commanded(**settings: Any) -> NodeSpec:
+    """A frame_source that simulates the microsystem under command: a frame for each cycle asked for."""
+    options = {f"simulator.{name}": value for name, value in settings.items()}
+    return NodeSpec(
+        "frame_source",
+        {"source": "simulator", "pacing": "rate", "rate": 0.0, "simulator.commanded": True, **options},
+    )
 
 
 def replayed(bag: str, topic: str = "") -> NodeSpec:
@@ -121,8 +137,7 @@ def _finite(kind: str, options: Mapping[str, Any]) -> NodeSpec:
     return NodeSpec("frame_source", {"source": kind, **pacing, **options}, ends_system=True)
 
 
-def _waiting_for_subscribers(node: NodeSpec, nodes: Sequence[NodeSpec]) -> NodeSpec:
-    subscribed = [topic for other in nodes for topic in _subscriptions(other)]
+def _waiting_for_subscribers(node: NodeSpec, subscribed: Sequence[str]) -> NodeSpec:
     waits = [
         f"{topic}:{subscribed.count(topic)}"
         for topic in _PUBLISHED.get(node.executable, ())
@@ -170,10 +185,24 @@ def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
     return chain(source, calibration=values["calibration"], output=values["output"])
 
 
+def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
+    size = int(values["size"])
+    source = commanded(
+        width_px=size, height_px=size, seed=int(values["seed"]), optics_seed=int(values["optics_seed"])
+    )
+    controller = NodeSpec("controller", {"law": values["law"]})
+    return chain(source, calibration=values["calibration"], output=values["output"], controller=controller)
+
+
 _CALIBRATION = {"calibration": ("", "Calibration file; empty: x and y only")}
 _OUTPUT = {"output": ("", "Directory of the bag to record; empty: none")}
 _CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
 _NAMESPACE = {"namespace": ("", "Namespace of the nodes and their topics")}
+_SIMULATION = {
+    "size": ("2048", "Width and height of the frames, px"),
+    "seed": ("1", "Seed of particles, motion and noise"),
+    "optics_seed": ("1", "Seed of the optics; must be that of the calibration"),
+}
 
 SYSTEMS = {
     "live": System(
@@ -206,14 +235,24 @@ SYSTEMS = {
         {
             **_CALIBRATION,
             "cycles": ("80", "Motion cycles; 80 are a revolution"),
-            "size": ("2048", "Width and height of the frames, px"),
-            "seed": ("1", "Seed of particles, motion and noise"),
-            "optics_seed": ("1", "Seed of the optics; must be that of the calibration"),
+            **_SIMULATION,
             **_OUTPUT,
             **_CONFIG,
             **_NAMESPACE,
         },
         _demo,
+    ),
+    "closed_loop": System(
+        "A simulated gear on a drive that errs, and a controller that brings it to the angles on psi_target.",
+        {
+            **_CALIBRATION,
+            "law": ("", "module:Class of the law that decides the motion; empty: the controller's own"),
+            **_SIMULATION,
+            **_OUTPUT,
+            **_CONFIG,
+            **_NAMESPACE,
+        },
+        _closed_loop,
     ),
 }
 

@@ -1,17 +1,21 @@
-"""Frames from the physical simulator."""
+"""Frames from the physical simulator, of a gear that turns by itself or under command."""
 
 from __future__ import annotations
 
 import itertools
 import math
+import threading
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
+from mems6dof_ros.control.actuator import Actuator
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
+from mems6dof_ros.simulation.experiment import Experiment, motion_frames
 from mems6dof_ros.simulation.experiment import loop as repeat
-from mems6dof_ros.simulation.experiment import motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.source import SourceInfo
 
@@ -52,6 +56,52 @@ class SimulatorSource:
 
     def stop(self) -> None:
         self._frames = iter(())
+
+
+def open_simulator(*, commanded: bool = False, **options: Any) -> SimulatorSource | CommandedSimulator:
+    """The source "simulator": SimulatorSource or, ``commanded``, CommandedSimulator."""
+    if not commanded:
+        return SimulatorSource(**options)
+    for name in ("cycles", "loop"):
+        if options.pop(name, 0):
+            raise InputError(name, "a number of cycles", "0 of a simulator that is commanded")
+    return CommandedSimulator(**options)
+
+
+class CommandedSimulator:
+    """The simulated gear under command: at the start one frame as it stands, then one after each motion cycle
+    that ``actuator`` is asked for.
+
+    Frames are live: stamped with the host clock at their exposure. ``experiment`` holds what may happen to
+    the measurement. ``settings`` are those of SimulationSettings; the rate is that of the commands.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        self.settings = SimulationSettings.from_dict(settings)
+        self.actuator = Actuator()
+        self.experiment = Experiment(self.settings)
+        self._started = False
+
+    @property
+    def info(self) -> SourceInfo:
+        return replace(SimulatorSource(**self.settings.to_dict()).info, kind="commanded simulator")
+
+    def start(self) -> None:
+        self._started = False
+
+    def read(self, timeout: float | None = None) -> Frame | None:
+        if self._started:
+            command = self.actuator.next_cycle(threading.TIMEOUT_MAX if timeout is None else timeout)
+            if command is None:
+                raise TimeoutError
+            self.experiment.advance(1, command.motion.direction, command.motion.amplitude)
+            self.actuator.cycle_done()
+        self._started = True
+        exposed_ns = time.time_ns()
+        return replace(self.experiment.frame(), stamp_ns=exposed_ns, live=True)
+
+    def stop(self) -> None:
+        self.actuator.enable(False)
 
 
 def camera_noise(settings: SimulationSettings) -> CameraNoise:

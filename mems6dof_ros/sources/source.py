@@ -55,9 +55,9 @@ class FrameSource(Protocol):
         ...
 
 
-#: Module and class of each kind of source, imported on use: a driver that is absent disturbs nobody.
+#: Module and constructor of each kind of source, imported on use: a driver that is absent disturbs nobody.
 SOURCES = {
-    "simulator": ("mems6dof_ros.sources.simulator", "SimulatorSource"),
+    "simulator": ("mems6dof_ros.sources.simulator", "open_simulator"),
     "images": ("mems6dof_ros.sources.images", "ImagesSource"),
     "bag": ("mems6dof_ros.sources.bag", "BagSource"),
     "video": ("mems6dof_ros.sources.video", "VideoSource"),

@@ -15,7 +15,15 @@ import mems6dof_ros
 from mems6dof_ros.nodes.system import SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = {"frame_source", "localizer", "pose_estimator", "recorder", "monitor", "foxglove_bridge"}
+NODES = {
+    "frame_source",
+    "localizer",
+    "pose_estimator",
+    "recorder",
+    "controller",
+    "monitor",
+    "foxglove_bridge",
+}
 
 
 def _package(path: Path) -> ElementTree.Element:

@@ -207,11 +207,12 @@ def test_tables_are_complete(name: str) -> None:
     system = SYSTEMS[name]
     table = system.table({"calibration": "c.yaml", "output": "out"})
     by_name = {node.executable: node.parameters for node in table}
-    assert list(by_name) == ["frame_source", "localizer", "pose_estimator", "recorder"]
+    controlled = ["controller"] if name == "closed_loop" else []
+    assert list(by_name) == ["frame_source", "localizer", "pose_estimator", *controlled, "recorder"]
     acknowledged = by_name["frame_source"].get("acknowledged_by")
     assert by_name["localizer"]["wait_for_subscribers"] == ["localizations:2"]
     assert by_name["pose_estimator"]["wait_for_subscribers"] == [
-        f"pose_6dof:{2 if acknowledged else 1}",
+        f"pose_6dof:{2 if acknowledged or controlled else 1}",
         "pose:1",
         "pose_with_covariance:1",
     ]

@@ -73,15 +73,15 @@ class InstrumentNode(Node):
         Nodes subscribe, or begin to publish, only then, so that readiness travels from the end of the chain
         to its beginning and the first message finds everybody listening.
         """
-        told = -float("inf")
+        tell_at, interval = 0.0, 5.0
 
         def look() -> None:
-            nonlocal told
+            nonlocal tell_at, interval
             if missing := waiting_for():
                 self.health.state = f"waiting for {missing}"
-                if time.monotonic() - told > 5.0:
-                    told = time.monotonic()
+                if time.monotonic() > tell_at:
                     self.get_logger().info(self.health.state)
+                    tell_at, interval = time.monotonic() + interval, 2 * interval
                 return
             timer.cancel()
             act()

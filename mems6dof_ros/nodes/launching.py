@@ -23,10 +23,12 @@ def description(system: System) -> Any:
 
 def _nodes(system: System, context: Any) -> list[Any]:
     values = {name: context.launch_configurations[name] for name in system.arguments}
-    return [_node(spec, values["namespace"], values["config"]) for spec in system.table(values)]
+    table = system.table(values)
+    finite = any(spec.ends_system for spec in table)
+    return [_node(spec, values["namespace"], values["config"], finite) for spec in table]
 
 
-def _node(spec: NodeSpec, namespace: str, config: str) -> Any:
+def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
     from launch.actions import Shutdown
     from launch_ros.actions import Node
 
@@ -39,5 +41,6 @@ def _node(spec: NodeSpec, namespace: str, config: str) -> Any:
         parameters=[*files, given(spec)],
         remappings=list(spec.remappings.items()),
         output="screen",
-        on_exit=Shutdown() if spec.ends_system else None,
+        # Of a finite system, the end of its source and the failure of any node are the end.
+        on_exit=Shutdown() if finite else None,
     )

@@ -18,14 +18,14 @@ from mems6dof_ros.sources.simulator import camera_noise
 
 
 @pytest.fixture(autouse=True)
-def domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> int:
+def domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
     """A ROS domain of this test's own, on this machine only, for this process and its children."""
-    number = own_domain()
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
     for name, value in transport.LOCALHOST_ONLY.items():
         monkeypatch.setenv(name, value)
-    return number
+    with own_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield number
 
 
 @pytest.fixture(scope="session")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-import os
+import contextlib
+import random
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,21 @@ SMALL_GEAR = {
 #: Seconds after which a wait has failed; nothing here takes more than a few on a quiet machine.
 PATIENCE = 60.0
 
-_domains = itertools.count(os.getpid())
 
-
-def own_domain() -> int:
-    """A ROS domain that nobody else on this machine is likely to use now."""
-    return 1 + next(_domains) % 100  # from 102 on, its ports are those of outgoing connections
+@contextlib.contextmanager
+def own_domain() -> Iterator[int]:
+    """A ROS domain that no other test on this machine uses: claimed by a socket of that name."""
+    domains = list(range(1, 102))  # from 102 on, the ports are those of outgoing connections
+    random.shuffle(domains)
+    for number in domains:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+            try:
+                claim.bind(f"\0mems6dof ROS domain {number}")
+            except OSError:
+                continue
+            yield number
+            return
+    raise RuntimeError("no free ROS domain")
 
 
 class Peer:

@@ -282,7 +282,7 @@ def test_launch_files_start_the_same_table(name: str) -> None:
         file, parameters = node.options["parameters"]
         assert file == f"settings/{spec.executable}.yaml"
         assert parameters.items() <= spec.parameters.items()
-        assert bool(node.options["on_exit"]) == spec.ends_system
+        assert bool(node.options["on_exit"]) == any(spec.ends_system for spec in table)
 
 
 def test_launch_files_load_where_launch_is_missing() -> None:

@@ -37,8 +37,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory, calibration: str) -> tup
     """A recorded run with its images: directory, exit codes, output."""
     path = tmp_path_factory.mktemp("system") / "bag"
     lines: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(own_domain()))
+    with pytest.MonkeyPatch.context() as patch, own_domain() as domain:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
         nodes = chain(
             simulated(CYCLES, **SMALL_GEAR),
             calibration=calibration,

@@ -18,6 +18,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "calibrate": "mems6dof_ros.cli.calibrate",
     "analyze": "mems6dof_ros.cli.analyze",
     "report": "mems6dof_ros.cli.report",
+    "check": "mems6dof_ros.cli.check",
     "recover": "mems6dof_ros.cli.recover",
     "demo": "mems6dof_ros.cli.demo",
     "monitor": "mems6dof_ros.cli.monitor",

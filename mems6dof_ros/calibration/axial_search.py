@@ -8,6 +8,8 @@ shape. The two best minima are refined; their difference in L tells how ambiguou
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -15,9 +17,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _REFINEMENTS = 8
+_LEAST_VARIANCE = 1e-20
+
+# Sums may be reordered (vectors); NaN keeps its meaning.
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FAST}
 
 
-@njit(cache=True, nogil=True)
+@njit(**_OPTIONS)
 def search_defocus(
     measured: Array,
     noise: Array,
@@ -43,29 +50,24 @@ def search_defocus(
     defocus = np.full((count, 2), np.nan)
     objective = np.full((count, 2), np.nan)
     chi_square = np.full((count, 2), np.nan)
-    curve = np.empty((points, k))
-    slope = np.empty((points, k))
+    # Grid points innermost: what is done alike for all of them runs in vectors.
+    scatter_of = np.ascontiguousarray(scatter.transpose(1, 2, 0))
+    basis_of, slope_basis_of = np.ascontiguousarray(basis.T), np.ascontiguousarray(slope_basis.T)
+    curve = np.empty((k, points))
+    slope = np.empty((k, points))
     level = np.empty(points)
+    residuals, factors = np.empty((k, points)), np.empty((k, k, points))
     residual = np.empty(k)
     tangent = np.empty(k)
     factor = np.empty((k, k))
     for i in range(count):
         first, last = limits[i]
-        for g in range(first, last + 1):
-            for a in range(k):
-                value = 0.0
-                derivative = 0.0
-                for m in range(local.shape[2]):
-                    value += local[i, a, m] * basis[g, m]
-                    derivative += local[i, a, m] * slope_basis[g, m]
-                curve[g, a] = value
-                slope[g, a] = derivative
-                residual[a] = measured[i, a] - value
-                for b in range(a + 1):
-                    factor[a, b] = noise[i, a, b] + scatter[g, a, b]
-            log_det = _factorize(factor, k)
-            chi, _, _ = _products(factor, residual, tangent, k)
-            level[g] = chi + log_det
+        _combine(local[i], basis_of, curve)
+        _combine(local[i], slope_basis_of, slope)
+        for a in range(k):
+            for g in range(points):
+                residuals[a, g] = measured[i, a] - curve[a, g]
+        _levels(noise[i], scatter_of, residuals, factors, level)
         for g in range(first, last + 1):
             if (g > first and level[g] >= level[g - 1]) or (g < last and level[g] > level[g + 1]):
                 continue
@@ -77,7 +79,7 @@ def search_defocus(
                 left = min(int(at), last - 1)
                 t = at - left
                 for a in range(k):
-                    y0, y1, d0, d1 = curve[left, a], curve[left + 1, a], slope[left, a], slope[left + 1, a]
+                    y0, y1, d0, d1 = curve[a, left], curve[a, left + 1], slope[a, left], slope[a, left + 1]
                     c2 = 3 * (y1 - y0) - 2 * d0 - d1
                     c3 = 2 * (y0 - y1) + d0 + d1
                     residual[a] = measured[i, a] - (y0 + t * (d0 + t * (c2 + t * c3)))
@@ -112,7 +114,53 @@ def search_defocus(
     return defocus, objective, chi_square
 
 
-@njit(cache=True, nogil=True)
+@njit(**_OPTIONS)
+def _combine(coefficients: Array, basis: Array, curves: Array) -> None:
+    """``curves = coefficients @ basis``."""
+    curves[:] = 0.0
+    for a in range(len(curves)):
+        for m in range(len(basis)):
+            c = coefficients[a, m]
+            for g in range(curves.shape[1]):
+                curves[a, g] += c * basis[m, g]
+
+
+@njit(**_OPTIONS)
+def _levels(noise: Array, scatter: Array, residuals: Array, factors: Array, levels: Array) -> None:
+    """``levels = r' C^-1 r + ln det C`` for ``C = noise + scatter`` at every grid point.
+
+    ``residuals`` (k, g), overwritten; ``scatter``, ``factors`` (k, k, g): lower Cholesky factors with their
+    diagonals inverted, since products are faster than divisions.
+    """
+    k, points = residuals.shape
+    determinant = np.ones(points)
+    levels[:] = 0.0
+    for a in range(k):
+        diagonal = factors[a, a]
+        for g in range(points):
+            diagonal[g] = noise[a, a] + scatter[a, a, g]
+        for b in range(a):
+            entry = factors[a, b]
+            for g in range(points):
+                entry[g] = noise[a, b] + scatter[a, b, g]
+            for c in range(b):
+                for g in range(points):
+                    entry[g] -= factors[a, c, g] * factors[b, c, g]
+            for g in range(points):
+                entry[g] *= factors[b, b, g]
+                diagonal[g] -= entry[g] * entry[g]
+                residuals[a, g] -= entry[g] * residuals[b, g]
+        for g in range(points):
+            variance = max(diagonal[g], _LEAST_VARIANCE)
+            determinant[g] *= variance
+            diagonal[g] = 1 / np.sqrt(variance)
+            residuals[a, g] *= diagonal[g]
+            levels[g] += residuals[a, g] * residuals[a, g]
+    for g in range(points):
+        levels[g] += np.log(determinant[g])
+
+
+@njit(**_OPTIONS)
 def _factorize(matrix: Array, k: int) -> float:
     """Cholesky factor in place (lower triangle); returns ln det."""
     log_det = 0.0
@@ -122,7 +170,7 @@ def _factorize(matrix: Array, k: int) -> float:
             for c in range(b):
                 total -= matrix[a, c] * matrix[b, c]
             if a == b:
-                total = max(total, 1e-30)
+                total = max(total, _LEAST_VARIANCE)
                 log_det += np.log(total)
                 matrix[a, a] = np.sqrt(total)
             else:
@@ -130,7 +178,7 @@ def _factorize(matrix: Array, k: int) -> float:
     return log_det
 
 
-@njit(cache=True, nogil=True)
+@njit(**_OPTIONS)
 def _products(factor: Array, residual: Array, tangent: Array, k: int) -> tuple[float, float, float]:
     """r'C^-1 r, t'C^-1 r and t'C^-1 t from the Cholesky factor of C; overwrites r and t."""
     chi = 0.0

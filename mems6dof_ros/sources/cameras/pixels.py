@@ -27,13 +27,6 @@ FORMATS = {
 }
 
 
-def check_format(name: str) -> str:
-    """``name``, or InputError where it is not one of FORMATS."""
-    if name not in FORMATS:
-        raise InputError("pixel_format", repr(name), f"one of {', '.join(FORMATS)}")
-    return name
-
-
 def full_scale(name: str) -> int:
     """Largest value of the format, ADU."""
     return (1 << FORMATS[name][0]) - 1

@@ -2,89 +2,106 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN
 from mems6dof_ros.sources.cameras.device import DeviceState
-from mems6dof_ros.sources.cameras.pixels import FORMATS, check_format, full_scale
+from mems6dof_ros.sources.cameras.pixels import FORMATS, full_scale
+
+
+def _setting(default: Any, unit: str, doc: str, **metadata: Any) -> Any:
+    """A field with its unit, meaning and, where it has them, range or choices."""
+    return dataclasses.field(default=default, metadata={"unit": unit, "doc": doc, **metadata})
 
 
 @dataclass(frozen=True)
 class CameraSettings:
     """Settings of a live camera; an empty or NaN one stays as the camera has it.
 
-    ``device``: which camera, as `mems6dof cameras` lists it; empty: the only one.
-    ``pixel_format``: PFNC name; empty: the deepest monochrome one.
-    ``exposure`` s. ``gain`` in the camera's unit (dB by GenICam's standard). ``frame_rate`` Hz.
-    ``region``: x, y, width, height, px; empty: the whole sensor.
-    ``trigger``: off (free running), software (one frame per 1/``frame_rate``, or per call of
-    ``trigger()`` where no rate is given), or the camera's name of an input, for instance Line1.
-    ``timestamp_at``: whether the device stamps the start or the end of the exposure.
-    ``latency`` s, from the end of the exposure to the first bytes in the host, where it was measured.
-    ``buffers``: frames that may wait in the driver. ``packet_size`` bytes, GigE Vision; 0: the largest that
-    gets through. ``pixel_size`` m in object space. ``saturation_adu`` 0: the end of the pixel format's scale
-    (a 12-bit sensor in Mono16 may saturate at 65520). ``features``: further GenICam features, "Name=value",
-    set before the others.
+    Each field carries ``metadata`` with ``unit``, ``doc`` and ``range``, ``choices`` or ``element`` (type of
+    the elements of a tuple), so that nodes and documentation can describe it. Raises InputError for a value
+    of the wrong type or out of range; what the camera itself refuses shows when it is opened.
     """
 
-    device: str = ""
-    pixel_format: str = ""
-    exposure: float = NAN
-    gain: float = NAN
-    frame_rate: float = NAN
-    region: tuple[int, ...] = ()
-    trigger: str = "off"
-    timestamp_at: str = "start"
-    latency: float = NAN
-    buffers: int = 16
-    packet_size: int = 0
-    pixel_size: float = NAN
-    saturation_adu: int = 0
-    features: tuple[str, ...] = ()
+    device: str = _setting("", "", "name, serial number or address of the camera; empty: the only one")
+    pixel_format: str = _setting(
+        "", "", "PFNC name; empty: the deepest monochrome one", choices=("", *FORMATS)
+    )
+    exposure: float = _setting(NAN, "s", "exposure time", range=(1e-7, 1e3))
+    gain: float = _setting(NAN, "dB", "gain, in the camera's own unit where it is not dB", range=(-1e3, 1e5))
+    frame_rate: float = _setting(
+        NAN, "Hz", "rate of a free-running camera or of software triggers", range=(1e-3, 1e5)
+    )
+    region: tuple[int, ...] = _setting((), "px", "x, y, width, height; empty: the sensor", element=int)
+    trigger: str = _setting(
+        "off",
+        "",
+        "off; software: at frame_rate, or where that is not given at each call of trigger(); or the name of"
+        " the camera's input, such as Line1: a frame per pulse",
+    )
+    timestamp_at: str = _setting(
+        "start", "", "what of the exposure the device stamps", choices=("start", "end")
+    )
+    latency: float = _setting(
+        NAN,
+        "s",
+        "from the end of the exposure to its first bytes in the host, if measured",
+        range=(0.0, 10.0),
+    )
+    buffers: int = _setting(16, "frames", "that may wait in the driver", range=(2, 1000))
+    packet_size: int = _setting(0, "bytes", "GigE Vision; 0: the largest that passes", range=(0, 65535))
+    pixel_size: float = _setting(NAN, "m", "image pixel size in object space", range=(1e-9, 1e-3))
+    saturation_adu: int = _setting(
+        0, "ADU", "largest pixel value; 0: end of the pixel format's scale", range=(0, 65535)
+    )
+    features: tuple[str, ...] = _setting((), "", "further GenICam features, Name=value", element=str)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, kind = getattr(self, field.name), type(field.default)
-            if kind is float and isinstance(value, int) and not isinstance(value, bool):
-                object.__setattr__(self, field.name, float(value))
-            elif kind is tuple and isinstance(value, Sequence) and not isinstance(value, str):
-                object.__setattr__(self, field.name, tuple(value))
-            elif not isinstance(value, kind) or isinstance(value, bool):
-                raise InputError(field.name, repr(value), f"a value of type {kind.__name__}")
-        if self.pixel_format:
-            check_format(self.pixel_format)
-        for name in ("exposure", "frame_rate", "pixel_size"):
-            if getattr(self, name) <= 0 or math.isinf(getattr(self, name)):
-                raise InputError(name, f"{getattr(self, name)}", "a positive number")
-        if self.latency < 0:
-            raise InputError("latency", f"{self.latency}", "0 s or more")
+        for field in dataclasses.fields(self):
+            _check(self, field)
         if self.region and not (
-            len(self.region) == 4
-            and all(isinstance(n, int) for n in self.region)
-            and min(self.region[:2]) >= 0
-            and min(self.region[2:]) > 0
+            len(self.region) == 4 and min(self.region[:2]) >= 0 and min(self.region[2:]) > 0
         ):
-            raise InputError("region", f"{self.region}", "x, y, width, height in whole pixels")
-        if self.timestamp_at not in ("start", "end"):
-            raise InputError("timestamp_at", repr(self.timestamp_at), "start or end")
+            raise InputError("region", f"{self.region}", "x, y, width, height in pixels")
         for entry in self.features:
-            if not isinstance(entry, str) or "=" not in entry:
+            if "=" not in entry:
                 raise InputError("features", repr(entry), "Name=value")
-        if self.buffers < 2:
-            raise InputError("buffers", f"{self.buffers}", "2 or more")
 
     @property
     def triggered(self) -> bool:
         return self.trigger != "off"
 
 
+def _check(settings: CameraSettings, field: dataclasses.Field[Any]) -> None:
+    """Type, range and choices as the field's metadata tell; makes tuples of lists and floats of integers."""
+    value, kind = getattr(settings, field.name), type(field.default)
+    if kind is float and type(value) is int:
+        value = float(value)
+    elif kind is tuple and isinstance(value, (list, tuple)):
+        element = field.metadata["element"]
+        if any(
+            not isinstance(v, (int, float) if element is int else element) or v != element(v) for v in value
+        ):
+            raise InputError(field.name, repr(value), f"elements of type {element.__name__}")
+        value = tuple(element(v) for v in value)
+    if type(value) is not kind:
+        raise InputError(field.name, repr(value), f"a value of type {kind.__name__}")
+    choices, span = field.metadata.get("choices"), field.metadata.get("range")
+    if choices and value not in choices:
+        raise InputError(field.name, repr(value), f"one of {', '.join(filter(None, choices))}")
+    if span and not span[0] <= value <= span[1] and value == value:
+        raise InputError(field.name, f"{value:g}", f"{span[0]:g} to {span[1]:g} {field.metadata['unit']}")
+    object.__setattr__(settings, field.name, value)
+
+
 def parse_settings(options: dict[str, Any]) -> CameraSettings:
     """CameraSettings from a user's options; InputError names the one that is unknown or wrong."""
-    known = {field.name for field in fields(CameraSettings)}
+    known = {field.name for field in dataclasses.fields(CameraSettings)}
     for name in options:
         if name not in known:
             raise InputError("camera", f"option '{name}'", f"one of {', '.join(sorted(known))}")

@@ -216,3 +216,41 @@ def test_the_recorded_poses_are_found_whatever_the_namespace(capsys, tmp_path):
             data = reader._reader.typestore.serialize_cdr(message, kind)
             writer.write(writer.add_channel(f"/left{topic}", kind), data, when)
     assert len(load_recording(tmp_path / "live").poses["load_gear"]) == 24
+
+
+def test_check_and_recover(capsys, tmp_path):
+    assert call(capsys, "check", SAMPLE)[0] == 0
+    shutil.copytree(SAMPLE, tmp_path / "bag")
+    file = next((tmp_path / "bag").glob("*.mcap"))
+    os.truncate(file, file.stat().st_size // 2)
+    assert "'mems6dof recover' completes" in refusal(capsys, "check", tmp_path / "bag")
+    status, text, _ = call(capsys, "recover", tmp_path / "bag")
+    assert status == 0
+    assert re.search(r"\d+ messages, completed, \d+ bytes cut off", text)
+    status, text, _ = call(capsys, "check", tmp_path / "bag")
+    assert (status, text.splitlines()[-1]) == (0, "whole")
+    assert len(list(frames(open_source("bag", path=tmp_path / "bag")))) > 8
+
+
+@pytest.mark.parametrize(
+    ("name", "pixel_size", "step", "beads", "planes"),
+    [
+        ("bead_stack_astigmatic_air085.tif", 63.5e-9, 1e-7, 6, slice(30, 36)),
+        ("bead_stack_plain_na095.tif", 108.33e-9, 3e-7, 20, slice(17, 20)),
+        ("bead_intrinsic_air085.tif", 130e-9, 3e-7, 1, slice(6, 10)),
+    ],
+)
+def test_real_micrographs(capsys, tmp_path, name, pixel_size, step, beads, planes):
+    """Beads near focus are found in every plane, and fitted with widths that such optics give."""
+    folder = Path(os.environ.get("MEMS6DOF_REAL_DATA", ROOT.parent / "shared" / "data"))
+    if not (folder / name).exists():
+        pytest.skip("no real micrographs here (MEMS6DOF_REAL_DATA)")
+    camera = ("--offset", 0, "--gain", 1, "--read-noise", 1)
+    scale = ("--pixel-size", pixel_size, "--step", step, "--calibration", "none")
+    assert call(capsys, "analyze", folder / name, "--out", tmp_path / "out", *scale, *camera)[0] == 0
+    _, found = read_table(tmp_path / "out" / "localizations.csv", LOCALIZATIONS)
+    near = (found["flags"] & ~512 == 0) & (found["cycle"] >= planes.start) & (found["cycle"] < planes.stop)
+    counts = np.bincount(found["cycle"][near], minlength=planes.stop)[planes]
+    assert (counts >= beads).all()
+    width = np.hypot(found["sigma_x_px"], found["sigma_y_px"])[near] * pixel_size
+    assert 0.15e-6 < np.median(width) < 2e-6

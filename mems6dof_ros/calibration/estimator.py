@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from mems6dof_ros.calibration.axial_search import search_defocus
 from mems6dof_ros.calibration.field_curves import Array
@@ -71,7 +71,7 @@ class Estimator:
         self._scatter = np.ascontiguousarray(
             model.scatter_at(self._grid)[:, self._used[:, None], self._used[None, :]]
         )
-        self._misfit = chi2.isf(MISFIT_PROBABILITY, max(len(used) - 1, 1))
+        self._misfit = chdtri(max(len(used) - 1, 1), MISFIT_PROBABILITY)
 
     def locate(self, fits: GaussianFits, moments: Moments | None = None) -> Positions:
         """Positions of ``fits`` (n); see :class:`~mems6dof_ros.calibration.interface.Positions`."""

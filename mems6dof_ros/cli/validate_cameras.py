@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 from mems6dof_ros import __version__
@@ -14,7 +15,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "cameras",
         help="camera drivers against emulated cameras",
         description="Run the real drivers against emulated cameras (those that are installed) and print the "
-        "figures. The exit status is 1 when one misses its requirement.",
+        "figures. The exit status is 1 when one misses its requirement or none could be measured.",
     )
     parser.add_argument("--seconds", type=float, default=30.0, help="of stream (default: %(default)s)")
     parser.add_argument("--size", type=int, default=2048, help="px, width and height (default: %(default)s)")
@@ -37,17 +38,13 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"--{name}", f"{value}", f"1 to {most:g}")
     with Progress("validate cameras") as progress:
         table = figures(args.seconds, args.size, args.rate, progress)
-    width = max(
-        len(row["quantity"])
-        for row in table
-        if row["passed"] is not None or row["measured"] == row["measured"]
-    )
+    width = max((len(row["quantity"]) for row in table if not math.isnan(row["measured"])), default=0)
     for row in table:
         verdict = {True: "pass", False: "FAIL", None: ""}[row["passed"]]
-        measured = "" if row["measured"] != row["measured"] else f"{row['measured']:.5g}"
+        measured = "" if math.isnan(row["measured"]) else f"{row['measured']:.5g}"
         print(f"{row['quantity']:<{width}}  {measured:>10}  {row['required']:<8}  {verdict}".rstrip())
-    failed = sum(row["passed"] is False for row in table)
-    print(f"{sum(row['passed'] is True for row in table)} passed, {failed} failed")
+    passed, failed = (sum(row["passed"] is verdict for row in table) for verdict in (True, False))
+    print(f"{passed} passed, {failed} failed")
     if args.json:
         record = {
             "format": "mems6dof validation 1",
@@ -56,4 +53,4 @@ def run(args: argparse.Namespace) -> int:
             "figures": table,
         }
         args.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return 1 if failed else 0
+    return 1 if failed or not passed else 0

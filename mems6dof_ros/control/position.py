@@ -104,6 +104,10 @@ class DriveModel:
         """Rotation of the drive by one cycle, rad."""
         return self.gain * max(amplitude - self.stiction, 0.0) / (1 - self.stiction)
 
+    def slack(self, direction: int) -> float:
+        """What the drive turns in ``direction`` before the gear follows, rad."""
+        return self._slack[direction]
+
     def plan(self, distance: float) -> Motion:
         """The next of the fewest equal cycles that turn the gear by ``distance`` rad."""
         direction = 1 if distance > 0 else -1

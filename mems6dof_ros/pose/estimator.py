@@ -397,11 +397,7 @@ class PoseEstimator:
 
     def _learn_noise(self, constellation: Constellation, rows: Indices, solution: Solution) -> None:
         """Compare the residuals with what the covariances claim, over all particles and for each."""
-        counted = np.stack([solution.use > UNUSED, solution.use == FULL], axis=1)
-        squares = np.where(counted, np.stack([solution.distance_xy, solution.distance_z], axis=1), 0.0)
-        freedom = counted * np.array([2.0, 1.0])
-        total = freedom.sum(axis=0)
-        freedom *= np.maximum(total - 3, 0) / np.maximum(total, 1)  # the pose takes three of each
+        squares, freedom = solution.squares, solution.freedom
         constellation.learn_noise(rows, squares * constellation.noise_factor(rows), freedom)
         self._noise += squares.sum(axis=0) * (self._noise[0] / self._noise[1]), freedom.sum(axis=0)
         self._noise /= np.maximum(1.0, self._noise[1] / NOISE_MEMORY)

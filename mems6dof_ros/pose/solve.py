@@ -26,8 +26,9 @@ class Solution(NamedTuple):
     """``pose``; its ``covariance`` (6, 6) in (d, w), see rigid.py; ``noise`` (6, 6), the part of it that
     comes from this frame alone; ``use`` (n,) of UNUSED, LATERAL, FULL; ``residual`` (n, 3) m;
     ``tested_z`` (n,): where the body's own z is known well enough for the residual to tell something;
-    ``distance_xy``, ``distance_z`` (n,) squared normalised residuals; ``chi_square`` and
-    ``degrees_of_freedom`` of the whole. ``ok`` is False where the particles do not fix a pose."""
+    ``squares`` (n, 2): squared normalised residuals in xy and z, and ``freedom`` (n, 2): their expectations
+    where the covariances are true, the particle's own pull on the pose taken off; 0 where not used;
+    ``chi_square`` and ``degrees_of_freedom`` of the whole. ``ok`` is False where the particles do not fix a pose."""
 
     ok: bool
     pose: RigidPose
@@ -36,8 +37,8 @@ class Solution(NamedTuple):
     use: NDArray[np.int64]
     residual: Array
     tested_z: NDArray[np.bool_]
-    distance_xy: Array
-    distance_z: Array
+    squares: Array
+    freedom: Array
     chi_square: float
     degrees_of_freedom: int
 
@@ -56,12 +57,12 @@ def solve_pose(
     """Pose that takes ``body`` (n, 3) onto ``measured`` (n, 3) m, covariances (n, 3, 3) m^2.
 
     ``start`` must be good to a micrometre in the plane; z and tilt are found robustly from there, up to
-    about 40 % of wrong z. ``has_z`` (n,): z counts. ``field`` (n, 3, k) m: modes of the field error scaled
-    to unit variance, k may be 0. Beyond ``gate_xy`` standard deviations a particle is left out, beyond
+    a third of wrong z, all to one side. ``has_z`` (n,): z counts. ``field`` (n, 3, k) m: modes of the
+    field error scaled to unit variance, k may be 0. Beyond ``gate_xy`` standard deviations a particle is left out, beyond
     ``gate_z`` only its z: a wrong axial branch does not cost a good x and y.
     """
     spread = np.einsum("nik,njk->nij", field, field)
-    rotation, translation, use, residual, weight, distance_xy, distance_z, ok = _gauss_newton(
+    rotation, translation, use, residual, weight, squares, freedom, ok = _gauss_newton(
         start.rotation, start.translation, body, body_covariance, measured, measured_covariance,
         spread, has_z, gate_xy, gate_z,
     )  # fmt: skip
@@ -70,7 +71,7 @@ def solve_pose(
     count_xy, count_z = int((use > UNUSED).sum()), int((use == FULL).sum())
     if not ok:
         nan = np.full((6, 6), np.nan)
-        return Solution(False, pose, nan, nan, use, residual, tested_z, distance_xy, distance_z, math.nan, 0)
+        return Solution(False, pose, nan, nan, use, residual, tested_z, squares, freedom, math.nan, 0)
 
     # The exact solution with the field error common to all: one linear step from a converged start.
     step, covariance, noise, chi_square = _marginalise(
@@ -79,8 +80,8 @@ def solve_pose(
     residual[use == UNUSED] = np.nan
     pose = RigidPose(_exp(step[3:]) @ rotation, translation + step[:3])
     return Solution(
-        bool(np.isfinite(covariance).all()), pose, covariance, noise, use, residual, tested_z, distance_xy, distance_z,
-        chi_square, 2 * count_xy + count_z - 6,
+        bool(np.isfinite(covariance).all()), pose, covariance, noise, use, residual, tested_z,
+        squares, freedom, chi_square, 2 * count_xy + count_z - 6,
     )  # fmt: skip
 
 
@@ -282,7 +283,9 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
     residual, moved = np.empty((n, 3)), np.empty((n, 3))
     weight, variance, s = np.zeros((n, 3, 3)), np.empty((n, 3, 3)), np.empty((3, 3))
     distance_xy, distance_z = np.full(n, np.nan), np.full(n, np.nan)
-    row = np.empty(3)
+    squares, freedom = np.zeros((n, 2)), np.zeros((n, 2))
+    normal = np.zeros((6, 6))
+    row, pull = np.empty(3), np.empty(3)
 
     # Start: z and the two tilts by least absolute deviations, x and y being matched already.
     for _ in range(20):
@@ -303,7 +306,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
                     normal3[a, b] += w * row[a] * row[b]
         step, ok = _solve_spd(normal3, right3)
         if not ok:
-            return rotation, translation, use, residual, weight, distance_xy, distance_z, False
+            return rotation, translation, use, residual, weight, squares, freedom, False
         translation[2] += step[0]
         rotation = _exp(np.array([step[1], step[2], 0.0])) @ rotation
         if abs(step[0]) < 1e-8 and abs(step[1]) + abs(step[2]) < 1e-4:
@@ -314,7 +317,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
     for iteration in range(25):
         wide = max(1.0, 2.0 / 2.0**iteration)
         changed = False
-        normal, right = np.zeros((6, 6)), np.zeros(6)
+        normal[:], right = 0.0, np.zeros(6)
         for i in range(n):
             p = body[i]
             for a in range(3):
@@ -357,27 +360,27 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
                 normal[a, 3] += h0
                 normal[a, 4] += h1
                 normal[a, 5] += h2
-                pull = w0 * rx + w1 * ry + w2 * rz
-                right[a] += pull
+                force = w0 * rx + w1 * ry + w2 * rz
+                right[a] += force
                 # Row a of J^T W J below: hat(v) times the above.
                 if a == 0:
                     for b, h in enumerate((h0, h1, h2)):
                         normal[4, 3 + b] += v2 * h
                         normal[5, 3 + b] -= v1 * h
-                    right[4] += v2 * pull
-                    right[5] -= v1 * pull
+                    right[4] += v2 * force
+                    right[5] -= v1 * force
                 elif a == 1:
                     for b, h in enumerate((h0, h1, h2)):
                         normal[3, 3 + b] -= v2 * h
                         normal[5, 3 + b] += v0 * h
-                    right[3] -= v2 * pull
-                    right[5] += v0 * pull
+                    right[3] -= v2 * force
+                    right[5] += v0 * force
                 else:
                     for b, h in enumerate((h0, h1, h2)):
                         normal[3, 3 + b] += v1 * h
                         normal[4, 3 + b] -= v0 * h
-                    right[3] += v1 * pull
-                    right[4] -= v0 * pull
+                    right[3] += v1 * force
+                    right[4] -= v0 * force
         normal[3:, :3] = normal[:3, 3:].T
         step, ok = _solve_spd(normal, right)
         if not ok:
@@ -388,6 +391,9 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
         if wide == 1.0 and small and not changed:
             break
 
+    if not ok:
+        return rotation, translation, use, residual, weight, squares, freedom, False
+    covariance = np.linalg.inv(normal)
     count_z = 0
     for i in range(n):
         p = body[i]
@@ -397,10 +403,31 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
         if use[i] == UNUSED:
             weight[i] = 0.0
             continue
-        count_z += use[i] == FULL
+        _pull(weight[i], moved[i], covariance, pull)
+        squares[i, 0], freedom[i, 0] = distance_xy[i], max(2.0 - pull[0] - pull[1], 0.0)
+        if use[i] == FULL:
+            squares[i, 1], freedom[i, 1] = distance_z[i], max(1.0 - pull[2], 0.0)
+            count_z += 1
         _turn(rotation, body_covariance[i], s)
         for a in range(3):
             for b in range(3):
                 s[a, b] += measured_covariance[i, a, b]
         _invert(s, use[i] == FULL, weight[i])
-    return rotation, translation, use, residual, weight, distance_xy, distance_z, ok and count_z >= 3
+    return rotation, translation, use, residual, weight, squares, freedom, count_z >= 3
+
+
+@njit(cache=True, nogil=True)
+def _pull(weight, v, covariance, out):  # type: ignore[no-untyped-def]
+    """Diagonal of ``W J C J^T`` into ``out`` (3,): the leverage of one particle in x, y and z."""
+    for a in range(3):
+        w0, w1, w2 = weight[a, 0], weight[a, 1], weight[a, 2]
+        row = (w0, w1, w2, w2 * v[1] - w1 * v[2], w0 * v[2] - w2 * v[0], w1 * v[0] - w0 * v[1])
+        first, one, other = (0, 4, 5) if a == 0 else ((1, 3, 5) if a == 1 else (2, 3, 4))
+        f_one = v[2] if a == 0 else (-v[2] if a == 1 else v[1])
+        f_other = -v[1] if a == 0 else (v[0] if a == 1 else -v[0])
+        total = 0.0
+        for c in range(6):
+            total += row[c] * (
+                covariance[c, first] + f_one * covariance[c, one] + f_other * covariance[c, other]
+            )
+        out[a] = total

@@ -7,6 +7,7 @@ nutation and step error, and localizations drawn with the covariance they claim,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -158,3 +159,11 @@ def make_localizations(position: Array, variance: Array, cycle: int) -> Localiza
         z_gap=np.full(n, np.nan),
         flags=np.where(np.isfinite(position[:, 2]), 0, Flag.NO_Z).astype(np.uint32),
     )
+
+
+def merged(views: Sequence[Localizations], seed: int) -> tuple[Localizations, NDArray[np.int64]]:
+    """All ``views`` of one cycle as one, shuffled; element i was element ``order[i]`` of them in a row."""
+    order = np.random.default_rng([seed, 7]).permutation(sum(len(view) for view in views))
+    position = np.concatenate([view.position for view in views])[order]
+    variance = np.concatenate([np.diagonal(view.covariance, axis1=1, axis2=2) for view in views])[order]
+    return make_localizations(position, variance, views[0].cycle), order

@@ -1,0 +1,65 @@
+"""`mems6dof validate pose`: the acceptance figures of the pose, as a table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from mems6dof_ros import __version__
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Options: seeds, cycles, whether to render frames."""
+    parser = subparsers.add_parser(
+        "pose",
+        help="accuracy and honesty of the pose against truth",
+        description="Measure the pose estimator against simulated truth and print the figures. "
+        "The exit status is 1 when one misses its requirement.",
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="default: 1 2 3")
+    parser.add_argument(
+        "--drift-cycles", type=int, default=2000, help="cycles of the test for drift (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--optical-cycles",
+        type=int,
+        default=0,
+        help="also run so many cycles from rendered frames, calibration included, for each seed: minutes"
+        " (default: none)",
+    )
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table; 1 where a figure misses its requirement."""
+    from mems6dof_ros.cli.progress import Progress
+    from mems6dof_ros.errors import InputError
+    from mems6dof_ros.pose.validation import figures
+
+    if args.drift_cycles < 200:
+        raise InputError("--drift-cycles", f"{args.drift_cycles}", "200 or more")
+    with Progress("validate pose") as progress:
+        table = figures(args.seeds, progress, args.drift_cycles, args.optical_cycles)
+    width = max(len(row["quantity"]) for row in table)
+    for row in table:
+        verdict = {True: "pass", False: "FAIL", None: ""}[row["passed"]]
+        print(
+            f"{row['quantity']:<{width}}  {row['measured']:>10.4g}  {row['required']:<12}  {verdict}".rstrip()
+        )
+    failed = sum(row["passed"] is False for row in table)
+    print(f"{sum(row['passed'] is True for row in table)} passed, {failed} failed")
+    if args.json:
+        record = {
+            "format": "mems6dof validation 1",
+            "software_version": __version__,
+            "parameters": {
+                "seeds": args.seeds,
+                "drift_cycles": args.drift_cycles,
+                "optical_cycles": args.optical_cycles,
+            },
+            "figures": table,
+        }
+        args.json.write_text(json.dumps(record, indent=1) + "\n")
+    return 1 if failed else 0

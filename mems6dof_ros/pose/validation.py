@@ -1,0 +1,471 @@
+"""The acceptance figures of the pose, each against truth that nothing was fitted to.
+
+Most use synthetic localizations (``synthetic.py``): thousands of cycles in seconds, noise known exactly.
+``optical_chain`` runs the whole way from rendered frames through calibration and fits.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mems6dof_ros.analysis.truth import TruthComparison, compare
+from mems6dof_ros.frame import GroundTruth
+from mems6dof_ros.localization.localizations import Localizations
+from mems6dof_ros.pose.bodies import Bodies
+from mems6dof_ros.pose.cycle_pose import DEGREES_OF_FREEDOM, CyclePose
+from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings, Region
+from mems6dof_ros.pose.solve import pose_jacobian
+from mems6dof_ros.pose.synthetic import GearMotion, Scene, SyntheticGear, make_localizations, merged
+
+Array = NDArray[np.float64]
+
+#: One row of the table: quantity, measured, required (text), passed (None: for information).
+Figure = dict[str, Any]
+
+#: Limits of issue and demonstration alike: m, m, m, rad, rad, rad.
+LIMITS = np.array([0.26e-9, 0.26e-9, 8e-9, 100e-6, 100e-6, 2.5e-6])
+#: A valid pose with a NEES beyond this is wrong: chance gives one in 1e10.
+WRONG = 60.0
+
+
+@dataclass
+class Run:
+    """Cycles of one body, with what is known to be true of them.
+
+    ``wrong_identities``: sightings given an identity that belongs to another particle; ``seconds``:
+    processor time of each update.
+    """
+
+    poses: list[CyclePose] = field(default_factory=list)
+    truths: list[GroundTruth] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    wrong_identities: int = 0
+    _owner: dict[int, int] = field(default_factory=dict)
+
+    def update(
+        self, estimator: PoseEstimator, gear: SyntheticGear, seen: Localizations, truth: GroundTruth
+    ) -> CyclePose:
+        """Feed one cycle and keep its outcome."""
+        start = time.thread_time()  # other processes must not count
+        pose = estimator.update(seen)
+        self.seconds.append(time.thread_time() - start)
+        self.add(pose, truth, gear.last_identity)
+        return pose
+
+    def add(self, pose: CyclePose, truth: GroundTruth, identity: NDArray[np.int64]) -> None:
+        """Keep one cycle; ``identity`` (n,): the true particle of each localization, -1 for none."""
+        self.poses.append(pose)
+        self.truths.append(truth)
+        for claimed, true in zip(pose.particle_id.tolist(), identity.tolist(), strict=True):
+            if claimed >= 0 and self._owner.setdefault(claimed, true) != true:
+                self.wrong_identities += 1
+
+    @property
+    def lost(self) -> int:
+        """Cycles without a valid pose."""
+        return sum(not pose.valid for pose in self.poses)
+
+    def comparison(self) -> TruthComparison:
+        """Against truth; see analysis/truth.py for the constants that are fitted."""
+        return compare(self.poses, self.truths)
+
+    @property
+    def wrong_poses(self) -> int:
+        """Valid poses that are far off what they claim."""
+        return int((self.comparison().nees > WRONG).sum())
+
+    def turns_off(self) -> int:
+        """Valid cycles whose unwrapped psi differs from truth by whole turns."""
+        difference = [
+            p.displacement[5] - t.psi for p, t in zip(self.poses, self.truths, strict=True) if p.valid
+        ]
+        return int((np.abs(np.array(difference) - difference[0]) > 0.1).sum())
+
+
+def follow(
+    scene: Scene,
+    seed: int,
+    cycles: int,
+    settings: PoseSettings | None = None,
+    steps: Iterable[tuple[float | None, int]] | None = None,
+) -> Run:
+    """Run an estimator over ``cycles`` observations; ``steps``: (rad per cycle, cycles) before each but the
+    first, None for the motion's own."""
+    gear, estimator, run = SyntheticGear(scene, seed), PoseEstimator(settings), Run()
+    plan = iter(steps) if steps is not None else iter([(None, 1)] * cycles)
+    for index in range(cycles):
+        if index:
+            gear.advance(*next(plan))
+        run.update(estimator, gear, *gear.observe())
+    return run
+
+
+def theory(truth: GroundTruth, sd_xy: float, sd_z: float) -> Array:
+    """Standard deviations (6,) that noise alone allows about the body's origin, the constellation being
+    known: ``(sum J^T S^-1 J)^-1`` over the particles of ``truth`` ."""
+    body = (truth.position - truth.translation) @ truth.rotation
+    jacobian = pose_jacobian(body, truth.rotation)
+    weight = np.array([sd_xy, sd_xy, sd_z]) ** -2.0
+    return np.sqrt(np.diag(np.linalg.inv(np.einsum("nia,i,nib->ab", jacobian, weight, jacobian))))
+
+
+def precision(counts: Sequence[int], seeds: Sequence[int], cycles: int) -> dict[int, Array]:
+    """Rms error over the theoretical precision, (6,), for each number of particles, all of them always in
+    view and noise alone acting, once the map has settled (the second half of ``cycles``)."""
+    ratios = {}
+    for count in counts:
+        scene = Scene(particles=count, radius=125e-6, motion=GearMotion(centre=(0.0, 0.0)))
+        squares = []
+        for seed in seeds:
+            run = follow(scene, seed, cycles, PoseSettings(field_degree=0, recentre_at=()))
+            late = run.comparison().between(cycles // 2, cycles)
+            expected = np.array(
+                [theory(truth, scene.sd_xy, scene.sd_z) for truth in run.truths[cycles // 2 :]]
+            )
+            squares.append((late.rms**2) / (expected**2).mean(axis=0))
+        ratios[count] = np.sqrt(np.mean(squares, axis=0))
+    return ratios
+
+
+def unsteady_steps(seed: int, cycles: int) -> list[tuple[float | None, int]]:
+    """A drive at its worst: regular steps, stalls, reversals, any step to 30 degrees, skipped teeth, and
+    ten frames lost, in random order."""
+    random = np.random.default_rng([seed, 5])
+    tooth = GearMotion().step
+    return [
+        [
+            (None, 1), (0.0, 1), (-tooth, 1), (float(random.uniform(0, math.radians(30))), 1), (2 * tooth, 1), (None, 11),
+        ][random.integers(6)]
+        for _ in range(cycles)
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """Outcome of a view that was taken away: cycles that claimed a pose meanwhile, cycles after its
+    return until a valid pose, and whether that pose was right."""
+
+    claimed: int
+    cycles_to_return: int
+    right: bool
+
+
+def interrupt(kind: str, seed: int, cycles: int = 5) -> Interruption:
+    """Take the view away for ``cycles``: ``covered`` (nothing, or a few false spots), ``shifted``, or
+    ``another`` constellation in its place."""
+    scene = Scene(missing=0.05, spurious=0.05)
+    gear, other, estimator, run = (
+        SyntheticGear(scene, seed),
+        SyntheticGear(scene, seed + 1000),
+        PoseEstimator(),
+        Run(),
+    )
+    claimed = 0
+    random = np.random.default_rng([seed, 6])
+    for index in range(30 + cycles + 10):
+        if index:
+            gear.advance()
+        away = 30 <= index < 30 + cycles
+        seen, truth = gear.observe(shift=(60e-6, -35e-6) if away and kind == "shifted" else (0.0, 0.0))
+        if not away:
+            run.update(estimator, gear, seen, truth)
+            continue
+        if kind == "covered":
+            count = 6 * (index % 2)
+            ghosts = np.c_[random.uniform(-120e-6, 120e-6, (count, 2)), np.zeros(count)]
+            seen = make_localizations(ghosts, np.full((count, 3), 1e-17), gear.cycle)
+        elif kind == "another":
+            other.cycle = gear.cycle
+            seen, _ = other.observe()
+        claimed += estimator.update(seen).valid
+    after = run.poses[30:]
+    back = next((i for i, pose in enumerate(after, 1) if pose.valid), len(after) + 1)
+    return Interruption(claimed, back, run.wrong_poses == 0 and run.turns_off() == 0)
+
+
+def two_bodies(seed: int, cycles: int) -> tuple[list[Run], list[Run]]:
+    """Two discs turning differently in one field: measured together, and each alone."""
+    scenes = [
+        Scene(particles=40, radius=55e-6, motion=GearMotion(centre=(-62e-6, 3e-6))),
+        Scene(
+            particles=40, radius=55e-6,
+            motion=GearMotion(centre=(63e-6, -2e-6), step=math.radians(-7.1), step_sd=math.radians(0.3)),
+        ),
+    ]  # fmt: skip
+    regions = [Region(centre=scene.motion.centre, outer_radius=62e-6) for scene in scenes]
+    # One small body alone does not see enough of the field to learn its error; noise alone acts here.
+    settings = PoseSettings(field_degree=0, field_size=scenes[0].field)
+    names = ["load_gear", "coupler"]
+    gears = [
+        SyntheticGear(scene, seed + 100 * i, name)
+        for i, (scene, name) in enumerate(zip(scenes, names, strict=True))
+    ]
+    together = Bodies(
+        [PoseEstimator(settings, name, region) for name, region in zip(names, regions, strict=True)]
+    )
+    alone = [PoseEstimator(settings, name) for name in names]
+    joint, single = [Run(), Run()], [Run(), Run()]
+    for index in range(cycles):
+        if index:
+            for gear in gears:
+                gear.advance()
+        views = [gear.observe() for gear in gears]
+        seen, order = merged([view for view, _ in views], seed + index)
+        for body, pose in enumerate(together.update(seen)):
+            # Identities of the other body count as none: taking one of them is an error.
+            sizes = [len(view) for view, _ in views]
+            identity = np.full(sum(sizes), -1)
+            start = sum(sizes[:body])
+            identity[start : start + sizes[body]] = gears[body].last_identity
+            joint[body].add(pose, views[body][1], identity[order])
+        for body, estimator in enumerate(alone):
+            single[body].update(estimator, gears[body], *views[body])
+    return joint, single
+
+
+def solve_time(seed: int, cycles: int = 300) -> Array:
+    """Processor times (cycles,) s of one update each, map update included, with about 100 particles in view and a map
+    that has seen a revolution."""
+    run = follow(Scene().with_visible(100), seed, 100 + cycles)
+    return np.array(run.seconds[100:])
+
+
+def optical_chain(
+    seed: int,
+    cycles: int,
+    electrons: float = 6e4,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TruthComparison:
+    """The whole way: calibrate simulated optics from focus stacks, render ``cycles`` of the turning gear,
+    localize, estimate; everything from ``seed``. Minutes."""
+    from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
+    from mems6dof_ros.calibration.focus_stack import measure_stack
+    from mems6dof_ros.cli.calibrate import WEIGHTING, WINDOW_PX
+    from mems6dof_ros.localization.localizer import Localizer
+    from mems6dof_ros.simulation.experiment import focus_stack, motion_frames
+    from mems6dof_ros.simulation.settings import SimulationSettings
+    from mems6dof_ros.sources.simulator import camera_noise
+
+    settings = SimulationSettings.from_dict({"seed": seed, "optics_seed": seed, "electrons": electrons})
+    rotations = (0.0, math.pi)
+    stacks = [
+        measure_stack(
+            focus_stack(settings, -4e-6, 4e-6, 0.25e-6, substrate_rotation=rotation),
+            camera_noise(settings), WEIGHTING, WINDOW_PX, f"substrate at {rotation:.2f} rad",
+        )
+        for rotation in rotations
+    ]  # fmt: skip
+    calibration = calibrate(stacks, CalibrationSettings(rotations=rotations), lambda text: None).calibration
+    localizer, estimator = Localizer(camera_noise(settings), calibration), PoseEstimator()
+    poses, truths = [], []
+    for index, frame in enumerate(motion_frames(settings, cycles), 1):
+        poses.append(estimator.update(localizer.localize(frame)))
+        truths.append(frame.truth[0])
+        progress(index, cycles)
+    return compare(poses, truths)
+
+
+# ------------------------------------------------------------------------------------ the table
+
+
+def figures(
+    seeds: Sequence[int],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    drift_cycles: int = 2000,
+    optical_cycles: int = 0,
+) -> list[Figure]:
+    """The table: everything above, on all ``seeds``; ``optical_cycles`` 0 leaves out the rendered frames."""
+    parts: list[Callable[[], list[Figure]]] = [
+        lambda: _accuracy(seeds),
+        lambda: _drift(seeds[:2], drift_cycles),
+        lambda: _clutter(seeds),
+        lambda: _unsteady(seeds),
+        lambda: _interruptions(seeds),
+        lambda: _precision(seeds),
+        lambda: _bodies(seeds),
+        lambda: _chained(seeds),
+        lambda: _time(seeds),
+    ]
+    if optical_cycles:
+        parts += [lambda seed=seed: _optics(seed, optical_cycles) for seed in seeds]  # type: ignore[misc]
+    table = []
+    for done, part in enumerate(parts):
+        progress(done, len(parts))
+        table += part()
+    progress(len(parts), len(parts))
+    return table
+
+
+def _row(quantity: str, measured: float, required: str = "", passed: bool | None = None) -> Figure:
+    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
+
+
+def _below(quantity: str, measured: float, limit: float, unit: str = "") -> Figure:
+    return _row(
+        f"{quantity}{', ' + unit if unit else ''}", measured, f"<= {limit:g}", bool(measured <= limit)
+    )
+
+
+def _between(quantity: str, measured: float, low: float, high: float) -> Figure:
+    return _row(quantity, measured, f"{low:g} to {high:g}", bool(low <= measured <= high))
+
+
+_SCALES = {"dx": ("nm", 1e9), "dy": ("nm", 1e9), "dz": ("nm", 1e9)}
+
+
+def _freedoms(what: str, rms: Array, limits: Array | None = None) -> list[Figure]:
+    rows = []
+    for index, name in enumerate(DEGREES_OF_FREEDOM):
+        unit, scale = _SCALES.get(name, ("urad", 1e6))
+        quantity = f"{what}: {name} rms"
+        if limits is None:
+            rows.append(_row(f"{quantity}, {unit}", rms[index] * scale))
+        else:
+            rows.append(_below(quantity, rms[index] * scale, limits[index] * scale, unit))
+    return rows
+
+
+def _accuracy(seeds: Sequence[int]) -> list[Figure]:
+    """Noise as of 6e4 electrons, with field errors of 5 nm and 30 nm that the covariances do not claim."""
+    rows = []
+    scene = Scene(field_error_xy=5e-9, field_error_z=30e-9)
+    for name, settings in (
+        ("field error 5, 30 nm", PoseSettings()),
+        ("same, not estimated", PoseSettings(field_degree=0)),
+    ):
+        comparisons = [follow(scene, seed, 240, settings).comparison() for seed in seeds]
+        rms = np.sqrt(np.mean([c.rms**2 for c in comparisons], axis=0))
+        honest = name.startswith("field")
+        rows += _freedoms(name, rms)
+        for first, last in ((0, 79), (80, 239)) if honest else ((0, 239),):
+            nees = float(np.mean([c.between(first, last).nees_per_dof for c in comparisons]))
+            label = f"{name}: NEES/6, cycles {first} to {last}"
+            rows.append(_between(label, nees, 0.8, 1.3) if honest else _row(label, nees))
+    return rows
+
+
+def _drift(seeds: Sequence[int], cycles: int) -> list[Figure]:
+    rows = []
+    for seed in seeds:
+        run = follow(
+            Scene(field_error_xy=5e-9, field_error_z=30e-9, missing=0.03, spurious=0.03), seed, cycles
+        )
+        result = run.comparison()
+        first, last = result.between(0, 99), result.between(cycles - 100, cycles)
+        ratio = float(np.sqrt(np.mean((last.rms / first.rms) ** 2)))
+        where = f"{cycles} cycles, seed {seed}"
+        rows.append(_below(f"{where}: error of the last 100 over the first 100", ratio, 1.15))
+        rows.append(_below(f"{where}: wrong identities", run.wrong_identities, 0))
+        rows.append(_below(f"{where}: cycles lost", run.lost, 0))
+    return rows
+
+
+def _clutter(seeds: Sequence[int]) -> list[Figure]:
+    rows = []
+    clean = {seed: follow(Scene(), seed, 160).comparison() for seed in seeds}
+    for fraction, limit in ((0.1, 1.1), (0.3, 1.3)):
+        scene = Scene(missing=fraction, spurious=fraction)
+        runs = {seed: follow(scene, seed, 160) for seed in seeds}
+        ratio = np.sqrt(
+            np.mean([(run.comparison().rms / clean[seed].rms) ** 2 for seed, run in runs.items()])
+        )
+        what = f"{fraction:.0%} missing, {fraction:.0%} spurious"
+        rows.append(_below(f"{what}: error over clean", float(ratio), limit))
+        rows.append(_below(f"{what}: wrong poses", sum(run.wrong_poses for run in runs.values()), 0))
+        rows.append(_below(f"{what}: cycles lost", sum(run.lost for run in runs.values()), 0))
+        rows.append(
+            _below(f"{what}: wrong identities", sum(run.wrong_identities for run in runs.values()), 0)
+        )
+    return rows
+
+
+def _unsteady(seeds: Sequence[int]) -> list[Figure]:
+    runs = [
+        follow(Scene(missing=0.1, spurious=0.1), seed, 200, steps=unsteady_steps(seed, 200)) for seed in seeds
+    ]
+    what = "0-30 degrees, stall, reverse, skip, 10 lost"
+    return [
+        _below(f"{what}: cycles lost", sum(run.lost for run in runs), 0),
+        _below(f"{what}: wrong poses", sum(run.wrong_poses for run in runs), 0),
+        _below(f"{what}: wrong identities", sum(run.wrong_identities for run in runs), 0),
+        _below(f"{what}: whole turns wrong", sum(run.turns_off() for run in runs), 0),
+    ]
+
+
+def _interruptions(seeds: Sequence[int]) -> list[Figure]:
+    rows = []
+    for kind in ("covered", "shifted", "another"):
+        results = [interrupt(kind, seed) for seed in seeds]
+        rows.append(_below(f"view {kind}: poses claimed meanwhile", sum(r.claimed for r in results), 0))
+        rows.append(
+            _below(f"view {kind}: cycles to recover, at most", max(r.cycles_to_return for r in results), 1)
+        )
+        rows.append(_below(f"view {kind}: wrong after return", sum(not r.right for r in results), 0))
+    return rows
+
+
+def _precision(seeds: Sequence[int]) -> list[Figure]:
+    rows = []
+    for count, ratio in precision((5, 10, 20, 50, 100, 200), seeds, 400).items():
+        worst = int(np.argmax(ratio))
+        rows.append(
+            _below(
+                f"{count} particles: error over theory, worst ({DEGREES_OF_FREEDOM[worst]})",
+                ratio[worst],
+                1.15,
+            )
+        )
+    return rows
+
+
+def _bodies(seeds: Sequence[int]) -> list[Figure]:
+    rows = []
+    runs = [two_bodies(seed, 200) for seed in seeds]
+    for body in range(2):
+        ratio = np.sqrt(
+            np.mean(
+                [
+                    (joint[body].comparison().rms / single[body].comparison().rms) ** 2
+                    for joint, single in runs
+                ]
+            )
+        )
+        rows.append(_below(f"two bodies: error of body {body + 1} over alone", float(ratio), 1.05))
+    wrong = sum(run.wrong_identities + run.lost for joint, _ in runs for run in joint)
+    rows.append(_below("two bodies: particles of the other body used, cycles lost", wrong, 0))
+    return rows
+
+
+def _chained(seeds: Sequence[int]) -> list[Figure]:
+    """What the paper's chained registration costs after two revolutions, for comparison."""
+    last = []
+    for reference in ("previous", "map"):
+        settings = PoseSettings(reference=reference)
+        ends = [follow(Scene(), seed, 161, settings).comparison().error[-20:, 5] for seed in seeds]
+        last.append(float(np.sqrt(np.mean(np.square(ends)))))
+    return [_row("reference previous: psi error after two revolutions over that of map", last[0] / last[1])]
+
+
+def _time(seeds: Sequence[int]) -> list[Figure]:
+    times = np.concatenate([solve_time(seed) for seed in seeds[:2]]) * 1e3
+    return [
+        _below("100 particles: update, median", float(np.median(times)), 1.0, "ms"),
+        _row("100 particles: update, 99th percentile, ms", float(np.percentile(times, 99))),
+        _row("100 particles: update, slowest (map solved), ms", float(times.max())),
+    ]
+
+
+def _optics(seed: int, cycles: int) -> list[Figure]:
+    result = optical_chain(seed, cycles)
+    rows = _freedoms(f"rendered frames, seed {seed}", result.rms, LIMITS)
+    rows.append(_between(f"rendered frames, seed {seed}: NEES/6", result.nees_per_dof, 0.8, 1.3))
+    tilt = np.hypot(*result.microscope.rotation[:2, 2])
+    rows.append(_row(f"rendered frames, seed {seed}: tilt of the calibrated plane, urad", tilt * 1e6))
+    return rows

@@ -33,12 +33,23 @@ class OpticalCalibration(Protocol):
     height) px; ``weighting`` and ``window_px``: the fit it was made with and must be used with.
     """
 
-    calibration_id: str
-    method: str
-    pixel_size: float
-    image_size: tuple[int, int]
-    weighting: str
-    window_px: int
+    @property
+    def calibration_id(self) -> str: ...
+
+    @property
+    def method(self) -> str: ...
+
+    @property
+    def pixel_size(self) -> float: ...
+
+    @property
+    def image_size(self) -> tuple[int, int]: ...
+
+    @property
+    def weighting(self) -> str: ...
+
+    @property
+    def window_px(self) -> int: ...
 
     def locate(self, fits: GaussianFits, image: NDArray[np.generic] | None = None) -> Positions:
         """Positions of ``fits``; failed fits give NaN, values beyond the range are flagged.

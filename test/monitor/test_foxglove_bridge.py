@@ -12,9 +12,9 @@ from pathlib import Path
 import aiohttp
 import numpy as np
 import pytest
-from conftest import Instrument
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from monitor_helpers import Instrument
 
 from mems6dof_ros.nodes.recorder import KNOWN_TYPES
 from mems6dof_ros.recording.definitions import typestore
@@ -98,7 +98,7 @@ def test_a_taken_port_is_one_line(bridge):
         module="mems6dof_ros.nodes.foxglove_bridge",
     )
     assert second.monitor.wait(20) == 1
-    second.machine.wait(20)
+    second.stop()
     assert len([line for line in second.lines if line.startswith("error: ") and port in line]) == 1
 
 

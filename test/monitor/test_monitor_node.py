@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import aiohttp
 import numpy as np
 import pytest
-from conftest import Instrument
+from monitor_helpers import Instrument
 
 from mems6dof_ros.monitor.history import COLUMNS
 
@@ -124,7 +124,7 @@ def test_the_node_ends_in_good_order_and_refuses_bad_parameters(instrument):
     for parameter in ("port:=70000", "history:=5", "colour:=red"):
         refused = Instrument("-p", parameter, machine_args=("--seconds", "0"))
         assert refused.monitor.wait(20) == 1
-        refused.machine.wait(20)
+        refused.stop()
         errors = [line for line in refused.lines if line.startswith("error: ")]
         assert len(errors) == 1
         assert "Traceback" not in "\n".join(refused.lines)

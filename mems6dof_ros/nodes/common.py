@@ -67,17 +67,33 @@ class InstrumentNode(Node):
         self.health.gauge("queue", self.worker.__len__)
         return self.worker
 
-    def when_ready(self, waiting_for: Callable[[], str], act: Callable[[], None]) -> None:
+    def when_ready(
+        self,
+        waiting_for: Callable[[], str],
+        act: Callable[[], None],
+        rehearse: Callable[[], None] = lambda: None,
+    ) -> None:
         """Call ``act`` in the executor's thread, once ``waiting_for`` returns nothing to wait for.
 
         Nodes subscribe, or begin to publish, only then, so that readiness travels from the end of the chain
-        to its beginning and the first message finds everybody listening.
+        to its beginning and the first message finds everybody listening. ``rehearse`` runs before, in a
+        thread: it computes what nobody sees, so that the first message does not wait for the compiler.
         """
         tell_at, interval = 0.0, 5.0
+        rehearsed = threading.Event()
+
+        def compile_kernels() -> None:
+            try:
+                rehearse()
+            except BaseException as error:  # handed to the main thread, which ends the node
+                self.failure = error
+            rehearsed.set()
+
+        threading.Thread(target=compile_kernels, name="rehearsal", daemon=True).start()
 
         def look() -> None:
             nonlocal tell_at, interval
-            if missing := waiting_for():
+            if missing := waiting_for() if rehearsed.is_set() else "the compiler":
                 self.health.state = f"waiting for {missing}"
                 if time.monotonic() > tell_at:
                     self.get_logger().info(self.health.state)

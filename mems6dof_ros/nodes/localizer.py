@@ -7,9 +7,9 @@ message: an empty one where the frame cannot be used, so that nobody waits for i
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -90,7 +90,6 @@ class LocalizerNode(InstrumentNode):
         self._matcher = FrameMatcher()
         self._count = 0
         self._last_counter: int | None = None
-        self._compiled = threading.Event()
         self._localizations = self.create_publisher(
             LocalizationsMessage, topics.LOCALIZATIONS, transport.MESSAGES
         )
@@ -102,28 +101,8 @@ class LocalizerNode(InstrumentNode):
             if calibration
             else "no calibration: x and y only"
         )
-        threading.Thread(target=self._compile, name="compile", daemon=True).start()
         missing = self.missing_subscribers({topics.LOCALIZATIONS: self._localizations})
-        self.when_ready(
-            lambda: missing() if self._compiled.is_set() else "the compiler of the fits", self._subscribe
-        )
-
-    def _compile(self) -> None:
-        """Localize one particle that nobody sees: the first frame must not wait for the compiler."""
-        try:
-            calibration = self._localizer.calibration
-            width, height = calibration.image_size if calibration else (256, 256)
-            camera = self._localizer.camera
-            y, x = np.indices((height, width)) - np.array([height // 2, width // 2])[:, None, None]
-            spot = 1000 * np.exp(-(x**2 + y**2) / (2 * 3.0**2)) + 10
-            level = np.clip(camera.offset_adu + camera.gain_adu_per_electron * spot, 0, 65535)
-            pixel_size = calibration.pixel_size if calibration else 1e-7
-            self._localizer.localize(Frame(level.astype(np.uint16), 0, 0, 0, pixel_size=pixel_size))
-        except InputError:
-            pass  # a frame will tell
-        except Exception as error:  # handed to the main thread, which ends the node
-            self.failure = error
-        self._compiled.set()
+        self.when_ready(missing, self._subscribe, lambda: rehearse(self._localizer))
 
     def _subscribe(self) -> None:
         self.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES)
@@ -209,6 +188,19 @@ def make_localizer(values: Mapping[str, Any]) -> Localizer:
         camera = CameraNoise(**given)
     detection = to_settings(DetectionSettings, "detection.", values)
     return Localizer(camera, calibration, to_settings(LocalizerSettings, "", values, detection=detection))
+
+
+def rehearse(localizer: Localizer) -> None:
+    """Localize one particle in the middle of a frame that nobody took."""
+    calibration, camera = localizer.calibration, localizer.camera
+    width, height = calibration.image_size if calibration else (256, 256)
+    pixel_size = calibration.pixel_size if calibration else 1e-7
+    y, x = np.indices((height, width)) - np.array([height // 2, width // 2])[:, None, None]
+    electrons = 10 + 1000 * np.exp(-(x**2 + y**2) / (2 * 3.0**2))
+    level = np.clip(camera.offset_adu + camera.gain_adu_per_electron * electrons, 0, 65535)
+    frame = Frame(level.astype(np.uint16), 0, 0, 0, pixel_size=pixel_size)
+    with contextlib.suppress(InputError):  # the first frame will tell
+        localizer.localize(frame)
 
 
 def point_cloud(found: Localizations) -> PointCloud2:

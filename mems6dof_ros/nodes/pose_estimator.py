@@ -26,6 +26,7 @@ from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.pose.settings import PoseSettings
+from mems6dof_ros.pose.synthetic import Scene, SyntheticGear
 from mems6dof_ros.recording import messages, topics
 
 _SETTINGS = {
@@ -69,7 +70,8 @@ class PoseEstimatorNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("pose_estimator", PARAMETERS)
-        self._estimator = PoseEstimator(to_settings(PoseSettings, "", self.values), self.values["body"])
+        settings = to_settings(PoseSettings, "", self.values)
+        self._estimator = PoseEstimator(settings, self.values["body"])
         self._using_estimator = threading.Lock()
         self._last_counter: int | None = None
         self._pose_6dof = self.create_publisher(Pose6DOF, topics.POSE_6DOF, transport.MESSAGES)
@@ -85,7 +87,7 @@ class PoseEstimatorNode(InstrumentNode):
             topics.POSE: self._pose,
             topics.POSE_WITH_COVARIANCE: self._pose_with_covariance,
         }
-        self.when_ready(self.missing_subscribers(publishers), self._subscribe)
+        self.when_ready(self.missing_subscribers(publishers), self._subscribe, lambda: rehearse(settings))
 
     def _subscribe(self) -> None:
         self.create_subscription(
@@ -158,6 +160,14 @@ class PoseEstimatorNode(InstrumentNode):
         except InputError as error:
             response.success, response.message = False, str(error)
         return response
+
+
+def rehearse(settings: PoseSettings) -> None:
+    """Follow a gear that nobody sees: from cycle to cycle, and once lost and found."""
+    gear, estimator = SyntheticGear(Scene(particles=40), seed=0), PoseEstimator(settings)
+    for step in (0.1, 0.1, 1.0, 0.1):
+        estimator.update(gear.observe()[0])
+        gear.advance(step)
 
 
 def main(args: list[str] | None = None) -> int:

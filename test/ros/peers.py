@@ -31,8 +31,8 @@ SMALL_GEAR = {
     "hub_diameter": 8e-6,
     "particles": 30,
 }
-#: Seconds after which a wait has failed; nothing here takes more than a few on a quiet machine.
-PATIENCE = 60.0
+#: Seconds after which a wait has failed; a few are enough, but a fresh clone compiles its kernels first.
+PATIENCE = 180.0
 
 
 @contextlib.contextmanager

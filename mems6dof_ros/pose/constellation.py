@@ -142,17 +142,18 @@ class Constellation:
         self.cycles += 1
         self._latest = pose
 
-    def field_response(self, rows: Indices, pose: RigidPose, modes: Array) -> Array:
-        """How the field error moves ``rows`` (n,) against their predicted places at ``pose``, (n, 3, k):
-        the directly seen ``modes``, less what the map has absorbed of them, less what is no error of
-        the motion but a constant of the frames (see ``_constant_response``)."""
-        absorbed = pose.rotation @ self.coupling[rows]
-        return np.asarray(modes + absorbed - self._constant(rows, pose))
+    def field_response(self, rows: Indices, pose: RigidPose, modes: Array) -> tuple[Array, Array]:
+        """How the field error moves ``rows`` (n,) against their predicted places at ``pose``: (n, 3, k) m for
+        modes of unit variance, and their covariance (n, 3, 3) m^2 in each.
 
-    def _constant(self, rows: Indices, pose: RigidPose) -> Array:
+        That is the directly seen ``modes``, less what the map has absorbed of them, less what is no error
+        of the motion but a constant of the frames (see ``_constant_response``).
+        """
         microscope, body = self._frames
-        turned = (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
-        return np.asarray(pose_jacobian(self.position[rows], pose.rotation) @ (microscope + turned))
+        constant = microscope + (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
+        return _field_response(
+            rows, modes, self.coupling, pose.rotation, self.position, constant, self.field_factor
+        )
 
     def linearisation(self, rows: Indices) -> Array:
         """Fixed positions (n, 3) m that ``observe`` refers to."""
@@ -332,7 +333,39 @@ class Candidates:
             setattr(self, name, getattr(self, name)[mask])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _field_response(rows, modes, coupling, rotation, position, constant, factor):  # type: ignore[no-untyped-def]
+    n, k = len(rows), modes.shape[2]
+    out, spread = np.zeros((n, 3, k)), np.empty((n, 3, 3))
+    line, moved = np.empty(k), np.empty(3)
+    for i in range(n):
+        p, g = position[rows[i]], coupling[rows[i]]
+        for a in range(3):
+            moved[a] = rotation[a, 0] * p[0] + rotation[a, 1] * p[1] + rotation[a, 2] * p[2]
+        for a in range(3):
+            # Row a of J = [1, -hat(R p)] has two entries beside the one.
+            one, other = (4, 5) if a == 0 else ((3, 5) if a == 1 else (3, 4))
+            by_one = moved[2] if a == 0 else (-moved[2] if a == 1 else moved[1])
+            by_other = -moved[1] if a == 0 else (moved[0] if a == 1 else -moved[0])
+            r0, r1, r2 = rotation[a, 0], rotation[a, 1], rotation[a, 2]
+            for m in range(k):
+                line[m] = (
+                    modes[i, a, m] + r0 * g[0, m] + r1 * g[1, m] + r2 * g[2, m]
+                    - constant[a, m] - by_one * constant[one, m] - by_other * constant[other, m]
+                )  # fmt: skip
+            for m in range(k):
+                for b in range(m + 1):
+                    out[i, a, b] += line[m] * factor[m, b]
+        for a in range(3):
+            for b in range(3):
+                total = 0.0
+                for m in range(k):
+                    total += out[i, a, m] * out[i, b, m]
+                spread[i, a, b] = total
+    return out, spread
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _accumulate(information, vector, rows, rotation, offset, weight, moved, modes):  # type: ignore[no-untyped-def]
     """Add one cycle to the normal equations, its pose eliminated; ``rows`` ascending, ``moved`` = R p.
 
@@ -367,16 +400,18 @@ def _accumulate(information, vector, rows, rotation, offset, weight, moved, mode
                 evidence[c, k + 3 * i + a] = w0 * rotation[0, a] + w1 * rotation[1, a] + w2 * rotation[2, a]
     gain = np.linalg.solve(normal, evidence)
     line = np.empty(k + 3 * n)
+    e0, e1, e2, e3, e4, e5 = evidence
     for row in range(k + 3 * n):
         place = row if row < k else k + 3 * rows[(row - k) // 3] + (row - k) % 3
-        line[: row + 1] = 0.0
-        drop = 0.0
-        for c in range(6):
-            g = gain[c, row]
-            drop += g * pull[c]
-            for column in range(row + 1):
-                line[column] += g * evidence[c, column]
-        vector[place] -= drop
+        g0, g1, g2, g3, g4, g5 = gain[:, row]
+        for column in range(row + 1):
+            line[column] = (
+                g0 * e0[column] + g1 * e1[column] + g2 * e2[column]
+                + g3 * e3[column] + g4 * e4[column] + g5 * e5[column]
+            )  # fmt: skip
+        vector[place] -= (
+            g0 * pull[0] + g1 * pull[1] + g2 * pull[2] + g3 * pull[3] + g4 * pull[4] + g5 * pull[5]
+        )
         for column in range(min(row + 1, k)):
             information[place, column] -= line[column]
         for j in range((row + 1 - k + 2) // 3 if row >= k else 0):

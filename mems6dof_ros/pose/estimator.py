@@ -144,7 +144,7 @@ class PoseEstimator:
         position, ids = view.position - pose.translation, self._new_ids(len(view.of))
         solution = solve_pose(
             pose, position, view.covariance * 1e-6, view.position, view.covariance, view.has_z,
-            np.zeros((len(ids), 3, 0)), s.gate_xy, s.gate_z,
+            np.zeros((len(ids), 3, 0)), np.zeros((len(ids), 3, 3)), s.gate_xy, s.gate_z,
         )  # fmt: skip
         if not solution.ok:
             return self._no_pose(localizations, Status.INITIALIZING, "the particles do not fix a pose")
@@ -207,11 +207,11 @@ class PoseEstimator:
         ids = constellation.ids[rows]
         modes = constellation.modes.evaluate(seen.position)
         factor = constellation.noise_factor(rows) * (self._noise[0] / self._noise[1])
-        response = constellation.field_response(rows, start, modes) @ constellation.field_factor
+        response, spread = constellation.field_response(rows, start, modes)
         solution = solve_pose(
             start, constellation.position[rows], constellation.covariance[rows],
             seen.position - modes @ constellation.field_mean, scaled(seen.covariance, factor), seen.has_z,
-            response, s.gate_xy, s.gate_z,
+            response, spread, s.gate_xy, s.gate_z,
         )  # fmt: skip
         used, used_z = int((solution.use > UNUSED).sum()), int((solution.use == FULL).sum())
         if not solution.ok or used < s.min_particles:

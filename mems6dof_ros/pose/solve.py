@@ -28,7 +28,8 @@ class Solution(NamedTuple):
     ``tested_z`` (n,): where the body's own z is known well enough for the residual to tell something;
     ``squares`` (n, 2): squared normalised residuals in xy and z, and ``freedom`` (n, 2): their expectations
     where the covariances are true, the particle's own pull on the pose taken off; 0 where not used;
-    ``chi_square`` and ``degrees_of_freedom`` of the whole. ``ok`` is False where the particles do not fix a pose."""
+    ``chi_square`` and ``degrees_of_freedom`` of the whole. ``ok`` is False where the particles do not fix
+    a pose."""
 
     ok: bool
     pose: RigidPose
@@ -51,6 +52,7 @@ def solve_pose(
     measured_covariance: Array,
     has_z: NDArray[np.bool_],
     field: Array,
+    spread: Array,
     gate_xy: float,
     gate_z: float,
 ) -> Solution:
@@ -58,10 +60,10 @@ def solve_pose(
 
     ``start`` must be good to a micrometre in the plane; z and tilt are found robustly from there, up to
     a third of wrong z, all to one side. ``has_z`` (n,): z counts. ``field`` (n, 3, k) m: modes of the
-    field error scaled to unit variance, k may be 0. Beyond ``gate_xy`` standard deviations a particle is left out, beyond
-    ``gate_z`` only its z: a wrong axial branch does not cost a good x and y.
+    field error scaled to unit variance, k may be 0, and ``spread`` (n, 3, 3) m^2 their covariance at
+    each place. Beyond ``gate_xy`` standard deviations a particle is left out, beyond ``gate_z`` only its z: a
+    wrong axial branch does not cost a good x and y.
     """
-    spread = np.einsum("nik,njk->nij", field, field)
     rotation, translation, use, residual, weight, squares, freedom, ok = _gauss_newton(
         start.rotation, start.translation, body, body_covariance, measured, measured_covariance,
         spread, has_z, gate_xy, gate_z,
@@ -142,7 +144,7 @@ def _solve_spd(matrix, right):  # type: ignore[no-untyped-def]
     return x * scale, True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _marginalise(moved, field, weight, residual, measured_covariance):  # type: ignore[no-untyped-def]
     """One linear step in the field error's coefficients (k, unit prior) and the pose (6), in this order.
 

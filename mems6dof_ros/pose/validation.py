@@ -139,12 +139,11 @@ def unsteady_steps(seed: int, cycles: int) -> list[tuple[float | None, int]]:
     ten frames lost, in random order."""
     random = np.random.default_rng([seed, 5])
     tooth = GearMotion().step
-    return [
-        [
-            (None, 1), (0.0, 1), (-tooth, 1), (float(random.uniform(0, math.radians(30))), 1), (2 * tooth, 1), (None, 11),
-        ][random.integers(6)]
-        for _ in range(cycles)
-    ]  # fmt: skip
+    steps: list[tuple[float | None, int]] = []
+    for kind in random.integers(6, size=cycles):
+        anything = float(random.uniform(0, math.radians(30)))
+        steps.append(((None, 1), (0.0, 1), (-tooth, 1), (anything, 1), (2 * tooth, 1), (None, 11))[kind])
+    return steps
 
 
 @dataclass(frozen=True)
@@ -231,8 +230,8 @@ def two_bodies(seed: int, cycles: int) -> tuple[list[Run], list[Run]]:
 
 
 def solve_time(seed: int, cycles: int = 300) -> Array:
-    """Processor times (cycles,) s of one update each, map update included, with about 100 particles in view and a map
-    that has seen a revolution."""
+    """Processor times (cycles,) s of one update each, map update included, with about 100 particles in view
+    and a map that has seen a revolution."""
     run = follow(Scene().with_visible(100), seed, 100 + cycles)
     return np.array(run.seconds[100:])
 
@@ -262,7 +261,9 @@ def optical_chain(
         )
         for rotation in rotations
     ]  # fmt: skip
-    calibration = calibrate(stacks, CalibrationSettings(rotations=rotations), lambda text: None).calibration
+    calibration: Any = calibrate(
+        stacks, CalibrationSettings(rotations=rotations), lambda text: None
+    ).calibration
     localizer, estimator = Localizer(camera_noise(settings), calibration), PoseEstimator()
     poses, truths = [], []
     for index, frame in enumerate(motion_frames(settings, cycles), 1):

@@ -90,6 +90,15 @@ def test_two_particles_fix_no_pose():
     body = np.array([[0.0, 0, 0], [1e-4, 0, 0]])
     covariance = np.tile(COVARIANCE, (2, 1, 1))
     solution = solve_pose(
-        IDENTITY, body, covariance * 1e-6, body, covariance, np.ones(2, bool), np.zeros((2, 3, 0)), 4.5, 4.0
+        IDENTITY,
+        body,
+        covariance * 1e-6,
+        body,
+        covariance,
+        np.ones(2, bool),
+        np.zeros((2, 3, 0)),
+        np.zeros((2, 3, 3)),
+        4.5,
+        4.0,
     )
     assert not solution.ok

@@ -75,6 +75,7 @@ class _Awaited:
 
     id: int
     motion: Motion
+    sent: float
     deadline: float
     cycle: int = 0
 
@@ -127,6 +128,8 @@ class Controller:
         before, self._pose = self._pose, pose
         if self.state is not State.MOVING:
             return None
+        if self._awaited and pose.stamp_ns * 1e-9 < self._awaited.sent:
+            return None  # exposed before the command: says nothing of its motion, however late it comes
         if why := self._why_stop(pose, now) or self._why_another_psi(before, pose):
             return self.stop(why)
         return self._decide(now)
@@ -170,7 +173,7 @@ class Controller:
         command = self._command(motion, now, pose)
         duration = motion.cycles / command.frequency
         deadline = now + self.settings.command_lifetime + duration + self.settings.acknowledge_timeout
-        self._awaited = _Awaited(command.id, motion, deadline)
+        self._awaited = _Awaited(command.id, motion, now, deadline)
         return Decision(command, pose)
 
     def _command(self, motion: Motion, now: float, pose: CyclePose | None) -> Command:

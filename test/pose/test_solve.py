@@ -30,11 +30,12 @@ def draw(seed, n=60, wrong_z=0.0, wrong_xy=0.0, field=None, field_sd=0.0):
     solution = solve_pose(
         IDENTITY,
         body,
-        np.zeros((n, 3, 3)) + 1e-24 * np.eye(3),
+        np.tile(1e-24 * np.eye(3), (n, 1, 1)),
         measured,
         covariance,
         np.ones(n, bool),
         response,
+        response @ response.transpose(0, 2, 1),
         4.5,
         4.0,
     )

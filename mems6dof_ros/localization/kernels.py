@@ -102,12 +102,15 @@ def _shape(theta: Array, window: int, stride: int, shape: Array) -> None:
         up[j] = up_ratio / down[j]
         down[j] *= down_ratio
     for i in range(1, half + 1):
+        # Slices: the compiler sees that what is written is not what is read, and uses vectors.
         below, above = row + i * stride, row - i * stride
+        line, last = shape[below : below + stride], shape[below - stride : below]
         for j in range(stride):
-            shape[below + j] = shape[below - stride + j] * down[j]
+            line[j] = last[j] * down[j]
             down[j] *= curve
+        line, last = shape[above : above + stride], shape[above + stride : above + 2 * stride]
         for j in range(stride):
-            shape[above + j] = shape[above + stride + j] * up[j]
+            line[j] = last[j] * up[j]
             up[j] *= curve
 
 

@@ -127,7 +127,9 @@ class MonitorNode(InstrumentNode):
             Snapshots(self, topics.IMAGE, rate, self._wants_image, self._images.put)
 
         self._painter.start()
-        self.tell(f"live page: {self._server.start()}")
+        # Printed, not logged: the address may hold a token, and logs and diagnostics are published.
+        print(f"live page: {self._server.start()}", flush=True)
+        self.tell("serving")
         self.health.gauge("pages with pictures", lambda: self._feed.watchers)
 
     def end(self, spin: Callable[[float], None]) -> None:

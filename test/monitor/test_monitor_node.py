@@ -117,6 +117,18 @@ def test_services_are_called(instrument):
     with_page(instrument, act)
 
 
+def test_the_token_is_told_to_nobody_but_the_terminal(monkeypatch):
+    monkeypatch.setenv("MEMS6DOF_MONITOR_TOKEN", "a token that stays here")
+    watched = Instrument("-p", "port:=0", machine_args=("--seconds", "0"))
+    try:
+        assert watched.url.endswith("/?token=a%20token%20that%20stays%20here")
+        tellers = [line for line in watched.lines if "token" in line]
+        assert len(tellers) == 1
+        assert tellers[0].startswith("live page: ")  # printed; a line of the log begins with its level
+    finally:
+        watched.stop()
+
+
 def test_the_node_ends_in_good_order_and_refuses_bad_parameters(instrument):
     assert instrument.url  # the other tests are done: the module's instrument may go
     assert instrument.stop() == 0

@@ -112,7 +112,10 @@ def _interrupted(
     start, states = client.cycles, len(client.states)
     here = client.states[-1].target if client.states else 0.0
     client.send(here + 3.0)
-    client.until(lambda: client.cycles >= start + 5, "motion")
+    client.until(lambda: len(client.states) > states, "command")
+    client.until(lambda: client.cycles >= start + 5 or client.states[-1].reason, "motion")
+    if client.states[-1].reason:
+        raise Mems6dofError(f"closed loop: stopped before it was interrupted: {client.states[-1].reason}")
     strike()
     struck_ns = time.time_ns()
     reason = "-"

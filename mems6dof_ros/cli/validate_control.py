@@ -1,0 +1,188 @@
+"""`mems6dof validate control`: the acceptance figures of the closed loop, as tables."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mems6dof_ros import __version__
+
+if TYPE_CHECKING:
+    from mems6dof_ros.simulation.settings import SimulationSettings
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Options: how many drives and targets, the size of the frames."""
+    parser = subparsers.add_parser(
+        "control",
+        help="angle errors, reaction and safe stops of the closed loop",
+        description="Bring simulated gears to random angles, first on synthetic poses with drives of many"
+        " kinds, then through ROS 2 from rendered frames; interrupt them; print the figures. The exit status"
+        " is 1 when one misses its requirement.",
+    )
+    parser.add_argument(
+        "--drives", type=int, default=20, help="simulated drives of each kind (default: %(default)s)"
+    )
+    parser.add_argument("--targets", type=int, default=20, help="random targets (default: %(default)s)")
+    parser.add_argument("--size", type=int, default=1024, help="width and height of the frames, px")
+    parser.add_argument("--seed", type=int, default=1, help="particles, motion, noise, targets")
+    parser.add_argument("--calibration", type=Path, help="of the simulated optics (default: made here)")
+    parser.add_argument("--no-ros", action="store_true", help="only what needs neither frames nor ROS 2")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the tables; 1 where a figure misses its requirement."""
+    from mems6dof_ros.errors import InputError
+    from mems6dof_ros.simulation.settings import SimulationSettings
+
+    for name in ("drives", "targets"):
+        if getattr(args, name) < 1:
+            raise InputError(f"--{name}", str(getattr(args, name)), "1 or more")
+    rows = [*_synthetic(args.drives, args.targets), *_faults()]
+    if not args.no_ros:
+        settings = SimulationSettings(width_px=args.size, height_px=args.size, seed=args.seed)
+        with tempfile.TemporaryDirectory() as folder:
+            rows += _real(settings, args.targets, args.calibration, Path(folder))
+    failed = sum(not row["passed"] for row in rows)
+    print(f"\n{len(rows) - failed} passed, {failed} failed")
+    if args.json:
+        record = {
+            "format": "mems6dof validation 1",
+            "software_version": __version__,
+            "parameters": {
+                "drives": args.drives,
+                "targets": args.targets,
+                "size": args.size,
+                "seed": args.seed,
+                "no_ros": args.no_ros,
+            },
+            "figures": rows,
+        }
+        args.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return 1 if failed else 0
+
+
+def _row(quantity: str, measured: float, limit: float) -> dict[str, Any]:
+    """A figure that must not exceed ``limit``."""
+    return {
+        "quantity": quantity,
+        "measured": measured,
+        "required": f"<= {limit:g}",
+        "passed": bool(measured <= limit),
+    }
+
+
+def _verdict(row: dict[str, Any]) -> str:
+    return "pass" if row["passed"] else "FAIL"
+
+
+def _synthetic(drives: int, targets: int) -> list[dict[str, Any]]:
+    """Angle errors of many drives, closed and open loop."""
+    import numpy as np
+
+    from mems6dof_ros.cli.progress import Progress
+    from mems6dof_ros.control.controller import State
+    from mems6dof_ros.control.validation import figures
+
+    rows, lines = [], []
+    with Progress("validate control: kinds of drives") as progress:
+        for drive, closed, opened in figures(drives, targets, progress):
+            error, blind = (1e3 * np.array([move.error for move in moves]) for moves in (closed, opened))
+            arrived = all(move.state is State.ARRIVED for move in closed)
+            largest = float(abs(error).max()) if arrived else np.inf
+            row = _row(f"largest error, mrad: {drive.name}", largest, drive.tolerance * 1e3)
+            cycles, fewest = (np.mean([getattr(m, name) for m in closed]) for name in ("cycles", "fewest"))
+            lines.append(
+                f"{drive.name:32}{largest:9.2f}{drive.tolerance * 1e3:9.2f}  {_verdict(row)}"
+                f"{_rms(error):9.2f}{_rms(blind):9.1f}{abs(blind).max():9.1f}{cycles:9.1f}{fewest:8.1f}"
+            )
+            rows.append(row)
+    print(
+        f"angle error at the end of {drives * targets} motions of each kind of drive, mrad; synthetic poses"
+    )
+    heads = ("largest", "limit", "", "rms", "open rms", "largest", "cycles", "fewest")
+    print(f"{'':32}" + "".join(f"{head:>{6 if not head else 9}}" for head in heads[:-1]) + f"{heads[-1]:>8}")
+    print("\n".join(lines))
+    return rows
+
+
+def _faults() -> list[dict[str, Any]]:
+    """Cycles made after each fault."""
+    from mems6dof_ros.control.validation import FAULTS, cycles_after
+
+    rows = []
+    print("\nmotion cycles made after a fault began; synthetic poses")
+    for name, fault in FAULTS.items():
+        cycles, reason = cycles_after(fault)
+        rows.append(_row(f"cycles after: {name}", cycles, 1))
+        print(f"{name:34}{cycles:3d}  {_verdict(rows[-1])}  {reason}")
+    return rows
+
+
+def _real(
+    settings: SimulationSettings, targets: int, calibration: Path | None, folder: Path
+) -> list[dict[str, Any]]:
+    """The same through ROS 2, from rendered frames."""
+    import numpy as np
+
+    from mems6dof_ros.cli.closed_loop import stage_table, summary
+    from mems6dof_ros.cli.progress import Progress
+    from mems6dof_ros.control.validation import open_loop, random_targets
+    from mems6dof_ros.nodes.closed_loop import approach, closed_loop, data_sheet, safe_stops
+
+    if calibration is None:
+        calibration = _calibrate(settings, folder / "optics.yaml")
+    drive, angles = data_sheet(settings), random_targets(targets, settings.seed)
+    with (
+        closed_loop(settings, calibration, folder / "nodes.log") as (client, _),
+        Progress("validate control: targets") as progress,
+    ):
+        closed = approach(client, settings, angles, progress)
+        table = stage_table(client)
+    size = f"{settings.width_px} x {settings.height_px} px"
+    print(f"\nangle error, mrad; {targets} random targets through ROS 2, frames of {size}")
+    print(f"{'':34}{'rms':>10}{'largest':>10}{'cycles':>10}")
+    print(summary("closed loop", closed))
+    print(summary("open loop, same drive", open_loop(settings, drive, angles)))
+    for move in closed:
+        if move.reason:
+            print(f"NOT reached: {move.target:.4f} rad, {move.reason}")
+    largest = np.inf if any(move.reason for move in closed) else max(abs(move.error) for move in closed) * 1e3
+    rows = [_row("largest error, mrad: ROS 2", float(largest), max(drive.resolution, 1e-3) * 1e3)]
+    print(f"\n{table}")
+    print("\nmotion cycles exposed after a loss; ROS 2")
+    for name, cycles, reason in safe_stops(settings, calibration, folder / "nodes.log"):
+        rows.append(_row(f"cycles after: {name}", cycles, 1))
+        print(f"{name:34}{cycles:3d}  {_verdict(rows[-1])}  {reason}")
+    return rows
+
+
+def _calibrate(settings: SimulationSettings, path: Path) -> Path:
+    """A calibration of the simulated optics, from two orientations of a bead substrate."""
+    import math
+
+    from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
+    from mems6dof_ros.calibration.file import save_calibration
+    from mems6dof_ros.calibration.focus_stack import measure_stack
+    from mems6dof_ros.cli.calibrate import WEIGHTING, WINDOW_PX
+    from mems6dof_ros.cli.progress import Progress
+    from mems6dof_ros.simulation.experiment import focus_stack
+    from mems6dof_ros.sources.simulator import camera_noise
+
+    rotations, stacks = (0.0, math.pi), []
+    with Progress("validate control: focus stacks") as progress:
+        for rotation in rotations:
+            frames = focus_stack(settings, -4e-6, 4e-6, 0.25e-6, substrate_rotation=rotation)
+            stacks.append(measure_stack(frames, camera_noise(settings), WEIGHTING, WINDOW_PX, "simulated"))
+            progress(len(stacks), len(rotations))
+    save_calibration(calibrate(stacks, CalibrationSettings(rotations=rotations)).calibration, path)
+    return path
+
+
+def _rms(values: Any) -> float:
+    return float((values**2).mean() ** 0.5)

@@ -28,6 +28,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
         "calibration": "mems6dof_ros.cli.validate_calibration",
         "pose": "mems6dof_ros.cli.validate_pose",
         "cameras": "mems6dof_ros.cli.validate_cameras",
+        "control": "mems6dof_ros.cli.validate_control",
     },
 }
 

@@ -18,7 +18,15 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 LOCKS = [ROOT / "requirements" / f"{name}.txt" for name in ("runtime", "ros", "dev")]
 PACKAGE = "mems6dof_ros"
-NODES = ("frame_source", "localizer", "pose_estimator", "recorder", "controller", "monitor", "foxglove_bridge")
+NODES = (
+    "frame_source",
+    "localizer",
+    "pose_estimator",
+    "recorder",
+    "controller",
+    "monitor",
+    "foxglove_bridge",
+)
 # What a sourced ROS or another activated wheel environment would push into ours.
 FOREIGN = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "PYTHONHOME")
 

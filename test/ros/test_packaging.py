@@ -81,7 +81,7 @@ def test_colcon_installs_what_ros2_run_and_launch_look_for(install: Path) -> Non
     assert (prefix / "share" / "ament_index" / "resource_index" / "packages" / "mems6dof_ros").is_file()
     assert (share / "package.xml").is_file()
     assert {path.name for path in (share / "launch").iterdir()} == {f"{name}.launch.py" for name in SYSTEMS}
-    assert {path.stem for path in (share / "config").iterdir()} == NODES
+    assert {path.stem for path in (share / "config").glob("*.yaml")} == NODES
     assert (install / "mems6dof_msgs" / "share" / "mems6dof_msgs" / "msg" / "Pose6DOF.msg").is_file()
 
 

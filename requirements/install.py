@@ -7,6 +7,7 @@ content it was made from is unchanged.
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -18,15 +19,6 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 LOCKS = [ROOT / "requirements" / f"{name}.txt" for name in ("runtime", "ros", "dev")]
 PACKAGE = "mems6dof_ros"
-NODES = (
-    "frame_source",
-    "localizer",
-    "pose_estimator",
-    "recorder",
-    "controller",
-    "monitor",
-    "foxglove_bridge",
-)
 # What a sourced ROS or another activated wheel environment would push into ours.
 FOREIGN = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "PYTHONHOME")
 
@@ -115,7 +107,7 @@ def install_package() -> None:
     link(share / PACKAGE / "package.xml", ROOT / "package.xml")
     for name, folder in (("launch", "launch_scripts"), ("config", "config"), ("bags", "bags")):
         link(share / PACKAGE / name, ROOT / folder)
-    for name in NODES:
+    for name in re.findall(r'"(\w+) = mems6dof_ros\.nodes\.', (ROOT / "setup.py").read_text()):
         link(VENV / "lib" / PACKAGE / name, VENV / "bin" / name)
 
 

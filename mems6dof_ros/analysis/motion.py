@@ -140,7 +140,8 @@ def order_spectrum(values: Array, psi: Array, highest: float = 1.5 * LOAD_GEAR_T
     Cycles need not be evenly spaced, so the drive's irregularity is no problem; but a body that
     is seen once per tooth shows the tooth-mesh order as a constant (aliasing): orders beyond half the
     number of cycles per revolution repeat lower ones, unless the steps scatter. Orders four times as dense
-    as the revolutions covered resolve, so that no peak falls between two. Raises InputError below one revolution.
+    as the revolutions covered resolve, so that no peak falls between two. Raises InputError below one
+    revolution.
     """
     turns = float(np.ptp(psi) / math.tau)
     if turns < 1:

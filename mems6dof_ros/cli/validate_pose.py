@@ -17,7 +17,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         description="Measure the pose estimator against simulated truth and print the figures. "
         "The exit status is 1 when one misses its requirement.",
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="default: 1 2 3")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5, 6], help="default: 1 to 6")
     parser.add_argument(
         "--drift-cycles", type=int, default=2000, help="cycles of the test for drift (default: %(default)s)"
     )
@@ -25,8 +25,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--optical-cycles",
         type=int,
         default=0,
-        help="also run so many cycles from rendered frames, calibration included, for each seed: minutes"
-        " (default: none)",
+        help="also run so many cycles from rendered frames, calibration included, for the first three seeds:"
+        " minutes (default: none)",
     )
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     parser.set_defaults(run=run)

@@ -78,6 +78,9 @@ class PoseEstimator:
         self._noise = np.full((2, 2), NOISE_PRIOR)
         self._half_field = np.zeros(2)
         self._place = np.zeros(2)
+        # Chained registration: error handed on, and which of the latest localizations the pose is from.
+        self._chained = np.zeros((6, 6))
+        self._in_solution = np.empty(0, bool)
 
     # ------------------------------------------------------------------------------- cycles
 
@@ -149,7 +152,7 @@ class PoseEstimator:
         if not solution.ok:
             return self._no_pose(localizations, Status.INITIALIZING, "the particles do not fix a pose")
         constellation.found(ids, position, view.covariance, constellation.modes.evaluate(view.position))
-        self.constellation = constellation
+        self.constellation, self._in_solution = constellation, np.ones(len(ids), bool)
         self._frame = self._frame._replace(
             rotation=np.eye(3), origin=np.zeros(3), place=pose.translation.copy(), psi=0.0
         )
@@ -181,7 +184,9 @@ class PoseEstimator:
             self._half_field = np.array(s.field_size) / 2
         else:
             self._half_field = np.abs(view.position[:, :2]).max(axis=0, initial=1e-6)
-        modes = FieldModes((float(self._half_field[0]), float(self._half_field[1])), s.field_degree)
+        # A chain has no map from which the field error could be told.
+        degree = s.field_degree if s.reference == "map" else 0
+        modes = FieldModes((float(self._half_field[0]), float(self._half_field[1])), degree)
         prior = modes.prior_variance(s.field_sd_xy, s.field_sd_z)
         return Constellation(modes, prior, s.retire_after, s.overlap)
 
@@ -224,14 +229,17 @@ class PoseEstimator:
 
         psi = unwrap_near(swing_twist(solution.pose.rotation)[2], psi_predicted)
         covariance = solution.covariance
-        if s.reference == "previous" and last is not None:
-            covariance = covariance + last.covariance
+        if s.reference == "previous":
+            self._chained += _exchanged(constellation, solution, rows, self._in_solution)
+            covariance = self._chained + solution.noise
         state = State(localizations.cycle, solution.pose, psi, covariance, solution.noise)
         inside = constellation.active & self._inside(state.pose.apply(constellation.position))
         expected = int(inside.sum())
         self._learn_noise(constellation, rows, solution)
         if s.reference == "previous":
-            self._follow(view, constellation, state.pose, match)
+            in_solution = np.zeros(len(view.of), bool)
+            in_solution[part] = solution.use > UNUSED
+            self._follow(view, constellation, state.pose, match, in_solution)
         else:
             self._learn(view, constellation, state, solution, match, part, modes, inside, factor)
         if last is None:
@@ -429,7 +437,9 @@ class PoseEstimator:
             constellation.add(candidates.ids[ready], position, candidates.covariance[ready], coupling)
             candidates.keep(~ready)
 
-    def _follow(self, view: Usable, constellation: Constellation, pose: RigidPose, match: Indices) -> None:
+    def _follow(
+        self, view: Usable, constellation: Constellation, pose: RigidPose, match: Indices, in_solution: Mask
+    ) -> None:
         """Chained registration: this cycle's localizations are the constellation of the next."""
         ids = np.where(match >= 0, constellation.ids[match], -1)
         ids[match < 0] = self._new_ids(int((match < 0).sum()))
@@ -439,7 +449,7 @@ class PoseEstimator:
         coupling = -pose.rotation.T @ successor.modes.evaluate(seen.position)
         successor.add(ids, pose.inverse().apply(seen.position), turned, coupling)
         successor.cycles = constellation.cycles + 1
-        self.constellation = successor
+        self.constellation, self._in_solution = successor, in_solution[view.good]
 
     # ---------------------------------------------------------------------------- reference
 
@@ -469,6 +479,24 @@ class PoseEstimator:
 
     def _no_pose(self, localizations: Localizations, status: Status, reason: str) -> CyclePose:
         return no_pose(localizations, self.body, self._frame.version, status, reason)
+
+
+def _exchanged(constellation: Constellation, solution: Solution, rows: Indices, before: Mask) -> Array:
+    """Covariance (6, 6) that one link of a chain adds to all later poses.
+
+    The noise n of the previous micrograph entered its own pose as P1 n, from the particles shared
+    ``before``, and enters this one as -P2 n, from ``rows`` shared now: only (P1 - P2) n stays, nothing where
+    all are the same.
+    """
+    rotation = solution.pose.rotation
+    jacobian = pose_jacobian(constellation.position, rotation)
+    weight = np.linalg.inv(rotation @ constellation.covariance @ rotation.T)
+    information = jacobian.transpose(0, 2, 1) @ weight @ jacobian
+    now = np.zeros(len(before), bool)
+    now[rows[solution.use > UNUSED]] = True
+    first, second = (np.linalg.inv(information[part].sum(axis=0)) for part in (before, now))
+    both = first @ information[before & now].sum(axis=0) @ second
+    return np.asarray(first + second - both - both.T)
 
 
 def _separation(one: Array, other: Array) -> Array:

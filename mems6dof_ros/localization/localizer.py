@@ -71,13 +71,15 @@ class Localizer:
         self._weighting = calibration.weighting if calibration else self.settings.weighting
         self._window_px = calibration.window_px if calibration else self.settings.window_px
 
-    def localize(self, frame: Frame) -> Localizations:
+    def localize(self, frame: Frame, candidates: NDArray[np.float64] | None = None) -> Localizations:
         """Localizations of all particles in ``frame``, none where it shows none.
 
+        ``candidates`` (n, 2), column and row in px: where to fit; None: wherever something is detected.
         Raises InputError for a frame that contradicts the calibration or the camera.
         """
-        pixel_size = self._check(frame)
-        candidates = detect(frame.image, self.settings.detection)
+        pixel_size = self.check(frame)
+        if candidates is None:
+            candidates = detect(frame.image, self.settings.detection)
         fits = fit_gaussians(frame.image, candidates, self.camera, self._weighting, self._window_px)
         fits = _take(fits, _first_of_each(fits, self.settings.detection.separation_px / 2))
         fits.flags[:] |= self._quality_flags(fits, pixel_size)
@@ -100,8 +102,8 @@ class Localizer:
             frame_published_ns=frame.published_ns,
         )
 
-    def _check(self, frame: Frame) -> float:
-        """The pixel size to use, m; InputError where frame, camera and calibration contradict each other."""
+    def check(self, frame: Frame) -> float:
+        """The pixel size of ``frame``, m; InputError where it contradicts the camera or the calibration."""
         where = f"frame {frame.frame_counter}"
         if 0 < frame.saturation_adu < self.camera.saturation_adu:
             raise InputError(

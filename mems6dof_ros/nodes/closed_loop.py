@@ -62,7 +62,7 @@ def closed_loop(
 
         with loop_client(check) as client, run_system(nodes, on_line=on_line) as system:
             systems.append(system)
-            client.ready()
+            client.ready(listeners=2 if bag else 1)  # the recorder listens too
             yield client, system
 
 

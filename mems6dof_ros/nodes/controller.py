@@ -64,11 +64,18 @@ class ControllerNode(InstrumentNode):
         self.when_ready(self._missing_drive, self._subscribe)
 
     def _missing_drive(self) -> str:
-        return "" if self._commands.get_subscription_count() else f"a drive on {topics.ACTUATION_COMMAND}"
+        """A drive is who hears commands and answers them; others, such as a recorder, only hear them."""
+        hearing = self.get_subscriptions_info_by_topic(topics.ACTUATION_COMMAND)
+        answering = self.get_publishers_info_by_topic(topics.ACTUATION_ACKNOWLEDGEMENT)
+        drives = {(end.node_namespace, end.node_name) for end in hearing} & {
+            (end.node_namespace, end.node_name) for end in answering
+        }
+        everybody = self._commands.get_subscription_count() >= len(hearing)
+        return "" if drives and everybody else f"a drive on {topics.ACTUATION_COMMAND}"
 
     def _subscribe(self) -> None:
-        self.create_subscription(Pose6DOF, topics.POSE_6DOF, self._on_pose, transport.MESSAGES)
         self.create_subscription(Float64, topics.PSI_TARGET, self._on_target, transport.MESSAGES)
+        self.create_subscription(Pose6DOF, topics.POSE_6DOF, self._on_pose, transport.MESSAGES)
         self.tell("idle")
 
     def end(self, spin: Callable[[float], None]) -> None:

@@ -73,10 +73,10 @@ class LoopClient:
                 raise Mems6dofError(f"closed loop: no {what} within {timeout:g} s")
             self._executor.spin_once(timeout_sec=0.1)
 
-    def ready(self) -> None:
-        """Wait until the gear has been seen as it stands, and the controller listens."""
+    def ready(self, listeners: int = 1) -> None:
+        """Wait until the gear has been seen as it stands, and so many listen for targets."""
         self.until(lambda: self.received[topics.TRUTH] and self.received[topics.POSE_6DOF], "first pose")
-        self.until(self._targets.get_subscription_count, "controller")
+        self.until(lambda: self._targets.get_subscription_count() >= listeners, "controller")
 
     def send(self, target: float) -> None:
         """Send a target, psi in rad, and return at once."""

@@ -9,6 +9,12 @@ from typing import Any
 import numpy as np
 
 from mems6dof_ros import __version__
+from mems6dof_ros.calibration.checks import (
+    against_reference,
+    drift,
+    stage_errors,
+    step_against_aperture,
+)
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.file import Calibration, ValidRange
 from mems6dof_ros.calibration.focus_stack import BeadStack, FocusStack, Rejection
@@ -24,14 +30,21 @@ BRIGHTNESS_FACTOR = 30.0
 #: Below this number of beads the scatter between particles is poorly known.
 FEW_BEADS = 10
 
+#: Orders for a quick look at one stack.
+_PLAIN = Orders(dict.fromkeys(GROUPS, 1), dict.fromkeys(GROUPS, 8), 1)
+
 
 @dataclass(frozen=True)
 class CalibrationSettings:
     """``axial_range`` m: largest |defocus| to declare valid (default: all that the stacks cover); stacks that
     reach 2 um further let particles beyond it be recognised. ``orders``: instead of choosing them by
-    cross-validation. ``rotations`` rad: the substrate's orientation in each stack."""
+    cross-validation. ``rotations`` rad: the substrate's orientation in each stack.
+    ``numerical_aperture`` and ``reference``, an earlier calibration of the same optics: what the stage's step
+    and direction are checked against."""
 
     axial_range: float | None = None
+    numerical_aperture: float | None = None
+    reference: Calibration | None = None
     orders: Orders | None = None
     rotations: tuple[float, ...] | None = None
 
@@ -82,7 +95,7 @@ def calibrate(
         ):
             x, y = bead.fits.parameters[bead.in_focus, :2]
             rejected.append(
-                Rejection(x, y, f"departs from the field's curves by {ratio:.0f} times the scatter", index)
+                Rejection(x, y, f"departs from its neighbours: {ratio:.0f} times the usual scatter", index)
             )
         beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
     chosen = [bead for _, bead in beads]
@@ -96,7 +109,7 @@ def calibrate(
         _valid_range(chosen, curves, interval, first, settings.axial_range),
         provenance=_provenance(stacks, settings, fit, len(beads), len(rejected)),
     )
-    warnings = _warnings(len(beads), fit)
+    warnings = _warnings(curves, rejected, fit, settings, first.pixel_size)
     return CalibrationResult(
         calibration, fit, tuple(stacks), tuple(chosen), tuple(curves), tuple(rejected), tuple(warnings)
     )
@@ -168,13 +181,43 @@ def _valid_range(
     return ValidRange(interval, x, y, (min(flux) / BRIGHTNESS_FACTOR, max(flux) * BRIGHTNESS_FACTOR))
 
 
-def _warnings(beads: int, fit: ModelFit) -> list[str]:
+def _warnings(
+    curves: Sequence[BeadCurve],
+    rejected: Sequence[Rejection],
+    fit: ModelFit,
+    settings: CalibrationSettings,
+    pixel_size: float,
+) -> list[str]:
     found = []
+    beads = len(curves)
+    if settings.numerical_aperture is not None:
+        found += step_against_aperture(curves, pixel_size, settings.numerical_aperture)
+    if settings.reference is not None:
+        found += against_reference(curves, settings.reference.model, "the reference calibration")
+    found += _against_each_other(curves, fit)
+    found += drift(fit, curves)
+    found += stage_errors(fit, curves)
+    saturated = sum(r.reason.startswith("saturated") for r in rejected)
+    if saturated > 0.1 * (beads + saturated):
+        found.append(f"{saturated} of {beads + saturated} beads are saturated: lower the light or exposure")
     if beads == 1:
         found.append("one bead: field dependence and the scatter between particles are unknown")
     elif beads < FEW_BEADS:
         found.append(f"only {beads} beads: the scatter between particles is poorly known")
     return found
+
+
+def _against_each_other(curves: Sequence[BeadCurve], fit: ModelFit) -> list[str]:
+    """Step and direction of every further stack against the first alone."""
+    stacks = [[curve for curve in curves if curve.stack == index] for index in {c.stack for c in curves}]
+    if len(stacks) < 2:
+        return []
+    alone = fit_model(stacks[0], fit.model.reference, fit.model.curves.interval, _PLAIN).model
+    return [
+        f"stack {stack[0].stack + 1}: {warning}"
+        for stack in stacks[1:]
+        for warning in against_reference(stack, alone, "the first stack")
+    ]
 
 
 def _provenance(
@@ -189,6 +232,8 @@ def _provenance(
         "software": f"mems6dof_ros {__version__}",
         "settings": {
             "axial_range_m": settings.axial_range,
+            "numerical_aperture": settings.numerical_aperture,
+            "reference": settings.reference.calibration_id if settings.reference else None,
             "orders": "cross-validation" if settings.orders is None else asdict(settings.orders),
             "rotations_rad": None if settings.rotations is None else list(settings.rotations),
         },

@@ -68,6 +68,7 @@ class Rejection:
 class FocusStack:
     """The beads of one stack and what they were measured with; ``stage_z`` (planes,) m.
 
+    ``gallery`` (planes, window, window) ADU: the bead nearest to the centre, whose index is ``shown``.
     ``sha256`` identifies the pixels and stage positions; ``description`` says where they came from.
     """
 
@@ -79,6 +80,8 @@ class FocusStack:
     camera: CameraNoise
     weighting: str
     window_px: int
+    gallery: NDArray[np.generic]
+    shown: int
     description: str
     sha256: str
 
@@ -103,6 +106,7 @@ def measure_stack(
     fits = _track(planes, seeds, camera, weighting, window_px, progress)
     moments = [residual_moments(p.image, f, camera, window_px) for p, f in zip(planes, fits, strict=True)]
     beads, rejected = _select(fits, moments, seeds, stage_z, window_px)
+    shown, gallery = _gallery(planes, beads, window_px)
     return FocusStack(
         beads,
         rejected,
@@ -112,6 +116,8 @@ def measure_stack(
         camera,
         weighting,
         window_px,
+        gallery,
+        shown,
         description,
         _digest(planes, stage_z),
     )
@@ -138,6 +144,22 @@ def _check_planes(planes: Sequence[Frame], where: str) -> tuple[Array, float, tu
         raise InputError(where, f"pixel size {pixel_size}", "the pixel size in object space, m")
     height, width = planes[0].image.shape
     return stage_z, pixel_size, (width, height)
+
+
+def _gallery(
+    planes: Sequence[Frame], beads: Sequence[BeadStack], window_px: int
+) -> tuple[int, NDArray[np.generic]]:
+    """Windows of the bead nearest to the image's centre, for the report; -1 without beads."""
+    image = planes[0].image
+    if not beads:
+        return -1, np.empty((0, window_px, window_px), image.dtype)
+    places = np.array([bead.fits.parameters[bead.in_focus, :2] for bead in beads])
+    centre = (np.array(image.shape[::-1]) - 1) / 2
+    shown = int(np.argmin(np.hypot(*(places - centre).T)))
+    column, row = np.rint(places[shown]).astype(int) - window_px // 2
+    column, row = max(column, 0), max(row, 0)
+    window = np.s_[row : row + window_px, column : column + window_px]
+    return shown, np.array([plane.image[window] for plane in planes])
 
 
 def _digest(planes: Sequence[Frame], stage_z: Array) -> str:

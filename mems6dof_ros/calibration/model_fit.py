@@ -31,6 +31,12 @@ FOCUS_ORDERS = (0, 1, 2, 3, 4)
 _FOLDS = 10
 _NODES = 41
 _ROUNDS = 3
+_MANY_BEADS = 20
+#: A plane of a bead is left out where its residual exceeds the median one by this factor (7 sigma).
+_OUTLIER = 10.0
+#: Rotation of the features into those that scatter independently: size and elongation, not two widths.
+_MODES = np.eye(len(FEATURES))
+_MODES[2:4, 2:4] = np.array([[1, 1], [1, -1]]) / np.sqrt(2)
 #: Of orders whose scores agree within this factor the fewest coefficients are taken.
 _AS_GOOD = 1.01
 #: Scatter assumed before it is known, as standard deviations of FEATURES: of the order of real beads'.
@@ -115,13 +121,15 @@ def fit_model(
         regression = alignment.regression(_highest(beads, interval, orders))
         if number > 0 and orders is not None:
             current = orders
-        elif number in (1, _ROUNDS) and len(beads) >= 3:
+        elif number in (1, _ROUNDS) and len(beads) != 2:
             validation = _cross_validate(regression, alignment, interval)
             current = _best(validation)
         curves = _fit(regression, current)
         residual = _held_out(regression, alignment, current)
         scatter = _scatter(alignment, residual, nodes)
         if number < _ROUNDS:
+            if number > 0 and len(beads) > 1:
+                alignment.drop_outliers(residual)
             alignment.align(curves)
     focus_scores, focus_order = _choose_focus_order(beads, alignment.sharpest, reference.radius, rotations)
     if orders is not None:
@@ -179,18 +187,37 @@ class _Alignment:
             ]
         )
         self.scatter: tuple[Array, Array]
+        self._kept = [np.ones(len(bead.stage_z), dtype=bool) for bead in beads]
 
     def samples(self) -> list[BeadSamples]:
         """The beads' curves about their present heights and places, within the interval."""
         found = []
-        for bead, sharpest, place in zip(self._beads, self.sharpest, self.place, strict=True):
-            u = sharpest - bead.stage_z
-            inside = (u >= self._interval[0]) & (u <= self._interval[1])
+        for number, (bead, place) in enumerate(zip(self._beads, self.place, strict=True)):
+            u, inside = self._planes(number)
             values = bead.features[inside].copy()
             values[:, :2] -= place
             variance = np.einsum("nkk->nk", self.covariance(bead, u, inside))
             found.append(BeadSamples(bead.x, bead.y, u[inside], values, 1 / variance))
         return found
+
+    def _planes(self, number: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Defocus of all planes of a bead, and which of them are used."""
+        u = self.sharpest[number] - self._beads[number].stage_z
+        return u, (u >= self._interval[0]) & (u <= self._interval[1]) & self._kept[number]
+
+    def drop_outliers(self, residual: list[Array]) -> None:
+        """Leave out single planes whose shape is far from that of all beads at the same defocus."""
+        u = np.concatenate([sample.argument for sample in self.samples()])
+        size = np.abs(np.concatenate(residual)[:, GROUPS["shape"]])
+        edges = np.linspace(*self._interval, _NODES // 2)
+        for_bin = np.digitize(u, edges)
+        usual = np.array([np.median(size[for_bin == k], axis=0) for k in for_bin])
+        dropped: NDArray[np.bool_] = np.any(size > _OUTLIER * usual, axis=1)
+        start = 0
+        for number in range(len(self._beads)):
+            inside = np.flatnonzero(self._planes(number)[1])
+            self._kept[number][inside[dropped[start : start + len(inside)]]] = False
+            start += len(inside)
 
     def covariance(self, bead: BeadCurve, u: Array, inside: NDArray[np.bool_]) -> Array:
         """Fit noise and scatter of the planes ``inside`` at defocus ``u``: (n, 6, 6)."""
@@ -200,21 +227,28 @@ class _Alignment:
 
     def noise(self) -> list[Array]:
         """Fit noise of the planes that ``samples`` has."""
+        return [bead.noise[self._planes(number)[1]] for number, bead in enumerate(self._beads)]
+
+    def pieces(self) -> list[BeadSamples]:
+        """What is left out together: whole beads, or the planes of the only one."""
+        samples = self.samples()
+        if len(samples) > 1:
+            return samples
+        only = samples[0]
         return [
-            bead.noise[(s - bead.stage_z >= self._interval[0]) & (s - bead.stage_z <= self._interval[1])]
-            for bead, s in zip(self._beads, self.sharpest, strict=True)
+            BeadSamples(only.x, only.y, only.argument[k], only.values[k], only.weights[k])
+            for k in (slice(n, n + 1) for n in range(len(only.argument)))
         ]
 
     def regression(self, highest: tuple[int, int]) -> FieldRegression:
-        return FieldRegression(self.samples(), self._radius, self._interval, *highest)
+        return FieldRegression(self.pieces(), self._radius, self._interval, *highest)
 
     def align(self, curves: FieldCurves) -> None:
         """One Gauss-Newton step of every bead's height, then of its lateral place."""
         shape = GROUPS["shape"]
         shift = np.zeros(len(self._beads))
         for number, (bead, sample) in enumerate(zip(self._beads, self.samples(), strict=True)):
-            u = self.sharpest[number] - bead.stage_z
-            inside = (u >= self._interval[0]) & (u <= self._interval[1])
+            u, inside = self._planes(number)
             covariance = self.covariance(bead, u, inside)
             local = np.repeat(
                 curves.local(np.array([bead.x]), np.array([bead.y])), len(sample.argument), axis=0
@@ -271,14 +305,14 @@ def _folds(count: int) -> list[NDArray[np.bool_]]:
 
 
 def _held_out(regression: FieldRegression, alignment: _Alignment, orders: Orders) -> list[Array]:
-    """Residual (n, 6) of every bead from the curves fitted without it (with it, where it is alone)."""
-    samples = alignment.samples()
-    residual: list[Array] = [np.empty(0)] * len(samples)
-    for left_out in _folds(len(samples)):
-        curves = _fit(regression, orders, None if len(samples) == 1 else ~left_out)
+    """Residual (n, k) of every bead from the curves fitted without it; of the only one plane by plane."""
+    pieces = alignment.pieces()
+    residual: list[Array] = [np.empty(0)] * len(pieces)
+    for left_out in _folds(len(pieces)):
+        curves = _fit(regression, orders, ~left_out)
         for index in np.flatnonzero(left_out):
-            residual[index] = _residual(samples[index], curves)
-    return residual
+            residual[index] = _residual(pieces[index], curves)
+    return residual if len(alignment.sharpest) > 1 else [np.concatenate(residual)]
 
 
 def _residual(sample: BeadSamples, curves: FieldCurves) -> Array:
@@ -289,19 +323,19 @@ def _residual(sample: BeadSamples, curves: FieldCurves) -> Array:
 def _cross_validate(
     regression: FieldRegression, alignment: _Alignment, interval: tuple[float, float]
 ) -> CrossValidation:
-    samples = alignment.samples()
+    pieces = alignment.pieces()
     beads = alignment._beads
     scores: dict[str, dict[tuple[int, int], float]] = {name: {} for name in GROUPS}
     field_orders = [order for order in FIELD_ORDERS if order <= _affordable_order(len(beads))]
     degrees = [degree for degree in DEGREES if degree <= _affordable_degree(beads, interval)]
-    folds = _folds(len(samples))
+    folds = _folds(len(pieces))
     for field_order in field_orders:
         for degree in degrees:
             total, count = np.zeros(len(FEATURES)), 0
             for left_out in folds:
                 curves = regression.fit(field_order, degree, ~left_out)
                 for index in np.flatnonzero(left_out):
-                    sample = samples[index]
+                    sample = pieces[index]
                     total += np.sum(_residual(sample, curves) ** 2 * sample.weights, axis=0)
                     count += len(sample.argument)
             for name, group in GROUPS.items():
@@ -326,12 +360,18 @@ def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Arra
     u = np.concatenate([sample.argument for sample in alignment.samples()])
     r = np.concatenate(residual)
     noise = np.concatenate(alignment.noise())
-    spacing = nodes[1] - nodes[0]
+    # Few beads cannot tell how the scatter varies with defocus, nor how features scatter together.
+    beads = len(residual)
+    width = (nodes[1] - nodes[0]) * max(1.5, 1.5 * np.sqrt(_MANY_BEADS / beads))
+    apart = max(0.0, 1 - beads / _MANY_BEADS)
     found = np.empty((len(nodes), len(FEATURES), len(FEATURES)))
     for index, node in enumerate(nodes):
-        weight = np.clip(1.5 - np.abs(u - node) / spacing, 0, None)
+        weight = np.clip(1 - np.abs(u - node) / width, 0, None)
         excess = r[:, :, None] * r[:, None, :] - noise
-        found[index] = _positive(np.einsum("n,nkl->kl", weight, excess) / max(weight.sum(), 1e-12))
+        mean = np.einsum("n,nkl->kl", weight, excess) / max(weight.sum(), 1e-12)
+        modes = _MODES @ mean @ _MODES.T
+        modes = (1 - apart) * modes + apart * np.diag(np.diag(modes))
+        found[index] = _positive(_MODES.T @ modes @ _MODES)
     return found
 
 

@@ -44,6 +44,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     fit.add_argument("--weighting", default=WEIGHTING, help="weighting of the fit (default: %(default)s)")
     fit.add_argument("--axial-range", type=float, help="largest |defocus| to declare valid, m")
+    fit.add_argument("--aperture", type=float, help="numerical aperture, to check the stage's step")
+    fit.add_argument("--reference", help="earlier calibration of these optics, to check step and direction")
     fit.add_argument("--method", help="method that the file proposes (default: the best by measurement)")
     parser.set_defaults(run=run)
 
@@ -51,8 +53,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the file and its report; nothing is written when interrupted."""
     from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
-    from mems6dof_ros.calibration.file import save_calibration
+    from mems6dof_ros.calibration.file import load_calibration, save_calibration
     from mems6dof_ros.calibration.focus_stack import measure_stack
+    from mems6dof_ros.calibration.report import write_report
     from mems6dof_ros.cli.progress import Progress
 
     stacks = []
@@ -63,11 +66,19 @@ def run(args: argparse.Namespace) -> int:
                 measure_stack(frames, camera, args.weighting, args.window, Path(path).name, progress)
             )
     rotations = None if args.rotation is None else tuple(args.rotation)
-    result = calibrate(stacks, CalibrationSettings(args.axial_range, None, rotations))
+    settings = CalibrationSettings(
+        axial_range=args.axial_range,
+        numerical_aperture=args.aperture,
+        reference=load_calibration(args.reference) if args.reference else None,
+        rotations=rotations,
+    )
+    result = calibrate(stacks, settings)
     calibration = result.calibration
     if args.method:
         calibration = calibration.with_method(args.method)
     save_calibration(calibration, args.out)
+    report = args.report or args.out.with_suffix(".html")
+    write_report(result, report)
     print(f"calibration {calibration.calibration_id}: {len(result.beads)} beads, method {calibration.method}")
     low, high = calibration.valid.z
     print(f"valid from {low * 1e6:.2f} to {high * 1e6:.2f} um about focus")
@@ -76,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in result.warnings:
         print(f"warning: {warning}")
     print(args.out)
+    print(report)
     return 0
 
 

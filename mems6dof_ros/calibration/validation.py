@@ -1,0 +1,390 @@
+"""The acceptance figures of the calibration, on particles, seeds and optics that nothing was fitted to.
+
+One set of beads calibrates simulated optics; other beads of the same optics, at other heights, are
+measured. The origin of z (where "in focus" is) and the tilt of the calibration substrate are conventions
+that no single focus stack can tell, so one plane is taken off the z errors of each set of optics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
+from mems6dof_ros.calibration.estimator import METHODS
+from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.file import Calibration
+from mems6dof_ros.calibration.focus_stack import FocusStack, measure_stack
+from mems6dof_ros.calibration.real_stacks import (
+    astigmatic_stack,
+    intrinsic_stack,
+    one_bead_left_out,
+    one_plane_left_out,
+    plain_orders,
+)
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.frame import Frame
+from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, fit_gaussians
+from mems6dof_ros.localization.localizations import GaussianFits
+from mems6dof_ros.simulation.aberrations import FieldAberrations
+from mems6dof_ros.simulation.experiment import BeadSubstrate, focus_stack
+from mems6dof_ros.simulation.optics import Objective, Optics
+from mems6dof_ros.simulation.settings import SimulationSettings
+from mems6dof_ros.sources.simulator import camera_noise
+
+#: One row of the table: quantity, measured, required (text), passed (None: for information).
+Figure = dict[str, Any]
+Progress = Callable[[int, int], None]
+
+WINDOW_PX = 41
+#: The stacks reach beyond the range that the calibration declares valid.
+STACK_REACH, STACK_STEP, VALID_RANGE = 6.6e-6, 0.2e-6, 4.2e-6
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Held-out particles: true ``position`` (n, 3) m and ``electrons`` (n,), with their ``fits`` in the
+    ``image`` that they were fitted in."""
+
+    position: Array
+    electrons: Array
+    fits: GaussianFits
+    image: NDArray[np.generic]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of particles without a flag: ``error`` and claimed ``sd`` (n, 3) m, true ``position``; of the
+    whole set the number ``seen``."""
+
+    error: Array
+    sd: Array
+    position: Array
+    seen: int
+
+    def rms(self, axis: int) -> float:
+        """Rms error along ``axis``, m."""
+        return float(np.sqrt(np.mean(self.error[:, axis] ** 2)))
+
+    def claimed_over_actual(self, axis: int) -> float:
+        """1 over the rms of error in units of its claimed standard deviation."""
+        return float(1 / np.sqrt(np.mean((self.error[:, axis] / self.sd[:, axis]) ** 2)))
+
+
+def simulated_stack(optics: str, seed: int, electrons: float, **settings: Any) -> FocusStack:
+    """A full-field focus stack of about 100 beads through the optics number ``seed``."""
+    simulated = SimulationSettings(
+        clumps=0, optics=optics, optics_seed=seed, electrons=electrons, seed=seed, **settings
+    )
+    frames = focus_stack(simulated, -STACK_REACH, STACK_REACH, STACK_STEP, beads=150, seed=10 + seed)
+    return measure_stack(frames, camera_noise(simulated), DEFAULT_WEIGHTING, WINDOW_PX, f"{optics} {seed}")
+
+
+def calibrated(optics: str, seed: int, electrons: float, **settings: Any) -> Calibration:
+    """Calibration of the optics number ``seed``, declared valid within VALID_RANGE of focus."""
+    stack = simulated_stack(optics, seed, electrons, **settings)
+    return calibrate([stack], CalibrationSettings(axial_range=VALID_RANGE)).calibration
+
+
+def held_out(
+    calibration: Calibration,
+    optics: str,
+    seed: int,
+    electrons: float,
+    reach: float,
+    frames: int = 6,
+    **settings: Any,
+) -> list[Particles]:
+    """Other beads of the same optics, evenly within ``reach`` m of focus; about 80 in each frame."""
+    simulated = SimulationSettings(
+        clumps=0, optics=optics, optics_seed=seed, electrons=electrons, seed=500 + seed, **settings
+    )
+    rng = np.random.default_rng([seed, 30])
+    size = np.array(simulated.image_size)
+    found = []
+    for number in range(frames):
+        stage_z = reach * (2 * (number + rng.uniform()) / frames - 1)
+        frame = BeadSubstrate(simulated, beads=150, seed=1000 * seed + number + 500).frame(float(stage_z))
+        truth = frame.truth[0]
+        px = truth.position[:, :2] / simulated.pixel_size + (size - 1) / 2
+        inside = ((px > WINDOW_PX // 2) & (px < size - WINDOW_PX // 2)).all(axis=1)
+        guess = px[inside] + rng.uniform(-1, 1, (int(inside.sum()), 2))
+        fits = fit_gaussians(
+            frame.image, guess, calibration.camera, calibration.weighting, calibration.window_px
+        )
+        found.append(Particles(truth.position[inside], truth.electrons[inside], fits, frame.image))
+    return found
+
+
+def errors(calibration: Calibration, particles: Sequence[Particles]) -> Errors:
+    """Locate ``particles`` and compare with truth."""
+    found = [calibration.locate(p.fits, p.image) for p in particles]
+    good = np.concatenate([f.flags == 0 for f in found]) & np.concatenate(
+        [p.fits.flags == 0 for p in particles]
+    )
+    position = np.concatenate([p.position for p in particles])
+    error = np.concatenate([f.position for f in found])[good] - position[good]
+    sd = np.sqrt(np.concatenate([np.einsum("nkk->nk", f.covariance) for f in found])[good])
+    plane = np.column_stack([np.ones(len(error)), position[good, :2]])
+    error[:, 2] -= plane @ np.linalg.lstsq(plane, error[:, 2], rcond=None)[0]
+    error[:, :2] -= error[:, :2].mean(axis=0)
+    return Errors(error, sd, position[good], len(good))
+
+
+def pooled(parts: Sequence[Errors]) -> Errors:
+    """All particles of several sets of optics."""
+    return Errors(
+        np.concatenate([p.error for p in parts]),
+        np.concatenate([p.sd for p in parts]),
+        np.concatenate([p.position for p in parts]),
+        sum(p.seen for p in parts),
+    )
+
+
+def axial_bound(particles: Sequence[Particles], seed: int, background: float, read_noise: float) -> Array:
+    """Cramer-Rao bound (n,) m of z for every particle of smooth optics number ``seed``.
+
+    From the Fisher information of the expected image about x, y, z, electrons and background, with
+    derivatives by central differences of the simulator's own images: all known but these five.
+    """
+    objective = Objective()
+    optics = Optics(objective, FieldAberrations.from_preset("smooth", seed, objective.wavelength))
+    step = 20e-9
+    size = (2048, 2048)
+    bounds = []
+    for p in particles:
+
+        def images(shift: Sequence[float], p: Particles = p) -> Array:
+            return optics.render(p.position + np.array(shift), p.electrons, 1e-6, size).image.astype(float)
+
+        middle = images((0, 0, 0))
+        half = middle.shape[1] // 2
+        centre = slice(half - WINDOW_PX // 2, half + WINDOW_PX // 2 + 1)
+        derivatives = []
+        for axis in range(3):
+            shift = [step * (axis == k) for k in range(3)]
+            # A window jumps by whole pixels; a shift across its border would not be a derivative.
+            forth, back = images(shift), images([-s for s in shift])
+            derivatives.append((forth - back) / (2 * step))
+        derivatives += [middle / p.electrons[:, None, None], np.ones_like(middle)]
+        jacobian = np.stack([d[:, centre, centre].reshape(len(middle), -1) for d in derivatives], axis=1)
+        variance = middle[:, centre, centre].reshape(len(middle), 1, -1) + background + read_noise**2
+        information = (jacobian / variance) @ jacobian.transpose(0, 2, 1)
+        bounds.append(np.sqrt(np.linalg.inv(information)[:, 2, 2]))
+    return np.concatenate(bounds)
+
+
+def figures(
+    seeds: Sequence[int], real_data: Path | None, progress: Progress = lambda done, total: None
+) -> list[Figure]:
+    """The whole table; ``seeds``: the optics to average over; ``real_data``: folder of real micrographs."""
+    parts: list[Callable[[Sequence[int]], list[Figure]]] = [
+        accuracy_figures,
+        bound_figures,
+        brightness_figures,
+        sign_change_figures,
+        range_figures,
+        bad_stack_figures,
+    ]
+    table: list[Figure] = []
+    steps = len(parts) + 1
+    for number, part in enumerate(parts):
+        progress(number, steps)
+        table += part(seeds)
+    progress(len(parts), steps)
+    if real_data is not None:
+        table += real_figures(real_data)
+    progress(steps, steps)
+    return table
+
+
+@cache
+def _calibration(optics: str, seed: int, electrons: float) -> Calibration:
+    return calibrated(optics, seed, electrons)
+
+
+def accuracy_figures(seeds: Sequence[int]) -> list[Figure]:
+    """z with local aberration, within 1.5 um of focus, calibrated at 1e5 electrons."""
+    limits = {("rho_amp", 3e4): 80, ("joint", 3e4): 40, ("joint", 1e5): 30}
+    table = []
+    for electrons in (3e4, 1e5):
+        sets = {}
+        for seed in seeds:
+            calibration = _calibration("paper", seed, 1e5)
+            sets[seed] = held_out(calibration, "paper", seed, electrons, 1.5e-6)
+        for method in METHODS:
+            found = pooled(
+                [errors(_calibration("paper", s, 1e5).with_method(method), sets[s]) for s in seeds]
+            )
+            name = f"{method}, {electrons:.0e} electrons"
+            table.append(_at_most(f"z rms, {name}, nm", found.rms(2) * 1e9, limits.get((method, electrons))))
+            table.append(_between(f"claimed over actual z, {name}", found.claimed_over_actual(2), 0.9, 1.15))
+            used = len(found.error) / found.seen
+            table.append(_figure(f"particles without a flag, {name}", used, "", None))
+    return table
+
+
+def bound_figures(seeds: Sequence[int]) -> list[Figure]:
+    """z over the Cramer-Rao bound: smooth aberrations, equal spheres, 1e5 electrons."""
+    equal: dict[str, Any] = {"diameter_spread": 0.0, "brightness_spread": 0.0}
+    found, bound = [], []
+    for seed in seeds:
+        calibration = calibrated("smooth", seed, 1e5, **equal)
+        particles = held_out(calibration, "smooth", seed, 1e5, 1.5e-6, **equal)
+        found.append(errors(calibration, particles))
+        bound.append(axial_bound(particles, seed, 10.0, 1.6))
+    rms = float(np.sqrt(np.mean(np.concatenate(bound) ** 2)))
+    measured = pooled(found)
+    return [
+        _at_most("z rms over Cramer-Rao bound, joint, 1e5 electrons", measured.rms(2) / rms, 1.5),
+        _figure("Cramer-Rao bound of z, 1e5 electrons, nm", rms * 1e9, "", None),
+        _between("claimed over actual z, joint, smooth optics", measured.claimed_over_actual(2), 0.9, 1.15),
+    ]
+
+
+def brightness_figures(seeds: Sequence[int]) -> list[Figure]:
+    """Calibrated at 3e5 electrons, measured dimmer and brighter, against calibrated in kind."""
+    seed = seeds[0]
+    table = []
+    for electrons in (3e4, 1e6):
+        other, kind = (_calibration("paper", seed, e) for e in (3e5, electrons))
+        particles = held_out(kind, "paper", seed, electrons, 1.5e-6)
+        crossed, same = errors(other, particles), errors(kind, particles)
+        name = f"calibrated at 3e5, measured at {electrons:.0e}"
+        table.append(_at_most(f"z rms over calibrated in kind, {name}", crossed.rms(2) / same.rms(2), 1.1))
+        bias = _bias_difference(other, kind, particles)
+        table.append(_at_most(f"bias of z against calibrated in kind, {name}, nm", bias * 1e9, 5))
+    return table
+
+
+def _bias_difference(one: Calibration, other: Calibration, particles: Sequence[Particles]) -> float:
+    """|mean z difference| that depends on defocus: the worst of three ranges about their common mean."""
+    difference, z = [], []
+    for p in particles:
+        a, b = one.locate(p.fits, p.image), other.locate(p.fits, p.image)
+        good = (a.flags == 0) & (b.flags == 0)
+        difference.append((a.position - b.position)[good])
+        z.append(p.position[good])
+    change, at = np.concatenate(difference)[:, 2], np.concatenate(z)
+    plane = np.column_stack([np.ones(len(at)), at[:, :2]])
+    change = change - plane @ np.linalg.lstsq(plane, change, rcond=None)[0]
+    thirds = np.digitize(at[:, 2], np.quantile(at[:, 2], [1 / 3, 2 / 3]))
+    return float(max(abs(np.mean(change[thirds == k])) for k in range(3)))
+
+
+def sign_change_figures(seeds: Sequence[int]) -> list[Figure]:
+    """Optics whose 45-degree astigmatism changes sign inside the field, 1e5 electrons, +/-4 um."""
+    seed = seeds[0]
+    calibration = _calibration("sign_change", seed, 1e5)
+    particles = held_out(calibration, "sign_change", seed, 1e5, 4e-6, frames=10)
+    table = []
+    for method in METHODS:
+        found = errors(calibration.with_method(method), particles)
+        worst = float(np.max(np.abs(found.error[:, 2]) / found.sd[:, 2]))
+        table.append(_at_most(f"worst unflagged z, sign change, {method}, claimed sd", worst, 5))
+        used = len(found.error) / found.seen
+        table.append(_figure(f"particles without a flag, sign change, {method}", used, "", None))
+    return table
+
+
+def range_figures(seeds: Sequence[int]) -> list[Figure]:
+    """Within 4 um of focus right or flagged; beyond the valid range flagged."""
+    table = []
+    seed = seeds[0]
+    calibration = _calibration("paper", seed, 1e5)
+    within = held_out(calibration, "paper", seed, 1e5, 4e-6, frames=10)
+    beyond = held_out(calibration, "paper", seed, 1e5, 8e-6, frames=16)
+    for method in METHODS:
+        chosen = calibration.with_method(method)
+        found = errors(chosen, within)
+        worst = float(np.max(np.abs(found.error[:, 2]) / found.sd[:, 2]))
+        table.append(_at_most(f"worst unflagged z within 4 um, {method}, claimed sd", worst, 5))
+        used = len(found.error) / found.seen
+        table.append(_figure(f"particles without a flag within 4 um, {method}", used, "", None))
+        far = [chosen.locate(p.fits, p.image).flags | p.fits.flags for p in beyond]
+        outside = [np.abs(p.position[:, 2]) > VALID_RANGE + 0.6e-6 for p in beyond]
+        missed = sum(int(np.count_nonzero((f == 0) & o)) for f, o in zip(far, outside, strict=True))
+        table.append(_at_most(f"unflagged beyond the range, {method}, particles", missed, 0))
+    return table
+
+
+def bad_stack_figures(seeds: Sequence[int]) -> list[Figure]:
+    """Stacks that must be refused or warned about: 1 where they are."""
+    settings = SimulationSettings(
+        clumps=0, width_px=640, height_px=640, optics_seed=seeds[0], electrons=1e5, seed=seeds[0]
+    )
+    camera = camera_noise(settings)
+    frames = list(focus_stack(settings, -4.5e-6, 4.5e-6, 0.25e-6, beads=60, seed=3))
+    aperture = settings.numerical_aperture
+
+    def outcome(stack: Sequence[Frame], reference: Calibration | None = None) -> str:
+        try:
+            measured = measure_stack(stack, camera, DEFAULT_WEIGHTING, WINDOW_PX, "stack")
+            result = calibrate(
+                [measured], CalibrationSettings(numerical_aperture=aperture, reference=reference)
+            )
+        except InputError as error:
+            return str(error)
+        return "; ".join(result.warnings)
+
+    good = calibrate([measure_stack(frames, camera, DEFAULT_WEIGHTING, WINDOW_PX, "stack")]).calibration
+    drifting = [replace(f, image=np.roll(f.image, round(0.4 * k), axis=1)) for k, f in enumerate(frames)]
+    ceiling = int(0.3 * max(f.image.max() for f in frames))
+    saturated = [replace(f, image=np.minimum(f.image, np.uint16(ceiling))) for f in frames]
+    few = list(focus_stack(settings, -4.5e-6, 4.5e-6, 0.25e-6, beads=8, seed=4))
+    cases = {
+        "a good stack": (frames, None, ""),
+        "wrong step": ([replace(f, stage_z=2 * f.stage_z) for f in frames], None, "step"),
+        "reversed direction": ([replace(f, stage_z=-f.stage_z) for f in frames], good, "direction"),
+        "too few beads": (few, None, "bead"),
+        "drift": (drifting, None, "drift"),
+    }
+    table = []
+    for name, (stack, reference, word) in cases.items():
+        said = outcome(stack, reference)
+        table.append(
+            _at_least(f"{name}: {said or 'no complaint'}", float((word in said) if word else not said))
+        )
+    camera = replace(camera, saturation_adu=ceiling)
+    said = outcome(saturated)
+    table.append(_at_least(f"saturation: {said or 'no complaint'}", float("saturated" in said)))
+    return table
+
+
+def real_figures(folder: Path) -> list[Figure]:
+    """Real micrographs: see the README of the data."""
+    left_out = one_bead_left_out(astigmatic_stack(folder), 500e-9, plain_orders(0, 6), "joint")
+    steps = one_plane_left_out(intrinsic_stack(folder), 1.05e-6, plain_orders(0, 6))
+    return [
+        _at_most("z rms, real astigmatic stack, one bead left out, nm", left_out.rms * 1e9, 30),
+        _at_most("median |z error|, real astigmatic stack, nm", left_out.median * 1e9, 18),
+        _between("claimed over actual, real astigmatic stack", left_out.claimed_over_actual, 0.9, 1.15),
+        _figure("flagged, real astigmatic stack", left_out.flagged, "", None),
+        _figure("stage steps, real intrinsic bead, one plane left out, rms nm", steps.rms * 1e9, "", None),
+        _figure("flagged, real intrinsic bead", steps.flagged, "", None),
+        _between("claimed over actual, real intrinsic bead", steps.claimed_over_actual, 0.9, 1.15),
+    ]
+
+
+def _figure(quantity: str, measured: float, required: str, passed: bool | None) -> Figure:
+    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
+
+
+def _at_most(quantity: str, measured: float, limit: float | None) -> Figure:
+    if limit is None:
+        return _figure(quantity, measured, "", None)
+    return _figure(quantity, measured, f"<= {limit:g}", bool(measured <= limit))
+
+
+def _at_least(quantity: str, measured: float, limit: float = 1) -> Figure:
+    return _figure(quantity, measured, f">= {limit:g}", bool(measured >= limit))
+
+
+def _between(quantity: str, measured: float, low: float, high: float) -> Figure:
+    return _figure(quantity, measured, f"{low:g} to {high:g}", bool(low <= measured <= high))

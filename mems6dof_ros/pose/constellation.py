@@ -10,6 +10,7 @@ the six directions that no observation can fix (the gauge) free of false informa
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 from numba import njit
@@ -191,8 +192,16 @@ class Constellation:
         return self.cycles - self._refined_at >= min(REFINE_AT_MOST, max(1, self.cycles // 8))
 
     def refine(self) -> None:
-        """Solve for all positions and the field error: milliseconds, hence not in every cycle."""
+        """Solve for all positions and the field error: milliseconds, hence not in every cycle.
+
+        Where covariances contradict each other beyond what numbers can hold, the map stays as it is.
+        """
+        self._refined_at = self.cycles
         self._forget_retired()
+        with suppress(np.linalg.LinAlgError):
+            self._solve()
+
+    def _solve(self) -> None:
         k, n = len(self.modes), len(self)
         information = self._information
         scale = 1 / np.sqrt(np.diag(information))
@@ -207,9 +216,9 @@ class Constellation:
         field_covariance = np.linalg.inv(field_information - cross.T @ gain[:, :k])
         field_mean = field_covariance @ (vector[:k] - cross.T @ gain[:, k])
         correction = (gain[:, k] - gain[:, :k] @ field_mean) * scale[k:]
-        self.field_mean = field_mean * scale[:k]
-        self.field_covariance = field_covariance * np.outer(scale[:k], scale[:k])
-        self.field_factor = np.linalg.cholesky(self.field_covariance)
+        field_covariance *= np.outer(scale[:k], scale[:k])
+        self.field_factor = np.linalg.cholesky(field_covariance)
+        self.field_mean, self.field_covariance = field_mean * scale[:k], field_covariance
         self.coupling = -(gain[:, :k] * scale[k:, None] / scale[:k]).reshape(n, 3, k)
         self.position = self._origin + correction.reshape(n, 3)
         inverse, _ = dpotri(factor[0], lower=1)
@@ -218,7 +227,6 @@ class Constellation:
             for b in range(a + 1):
                 block = inverse[first + a, first + b] * scale[k + first + a] * scale[k + first + b]
                 self.covariance[:, a, b] = self.covariance[:, b, a] = block
-        self._refined_at = self.cycles
         self._frames = self._constant_response()
 
     def _constant_response(self) -> Array:

@@ -227,11 +227,14 @@ class PoseEstimator:
         if implausible:
             return self._lost(localizations, implausible)
 
-        psi = unwrap_near(swing_twist(solution.pose.rotation)[2], psi_predicted)
-        covariance = solution.covariance
+        chained, covariance = self._chained, solution.covariance
         if s.reference == "previous":
-            self._chained += _exchanged(constellation, solution, rows, self._in_solution)
-            covariance = self._chained + solution.noise
+            chained = chained + _exchanged(constellation, solution, rows, self._in_solution)
+            covariance = chained + solution.noise
+        if not (np.diag(covariance) > 0).all():
+            return self._lost(localizations, "the particles do not fix a pose")
+        self._chained = chained
+        psi = unwrap_near(swing_twist(solution.pose.rotation)[2], psi_predicted)
         state = State(localizations.cycle, solution.pose, psi, covariance, solution.noise)
         inside = constellation.active & self._inside(state.pose.apply(constellation.position))
         expected = int(inside.sum())
@@ -494,7 +497,7 @@ def _exchanged(constellation: Constellation, solution: Solution, rows: Indices, 
     information = jacobian.transpose(0, 2, 1) @ weight @ jacobian
     now = np.zeros(len(before), bool)
     now[rows[solution.use > UNUSED]] = True
-    first, second = (np.linalg.inv(information[part].sum(axis=0)) for part in (before, now))
+    first, second = (np.linalg.pinv(information[part].sum(axis=0), hermitian=True) for part in (before, now))
     both = first @ information[before & now].sum(axis=0) @ second
     return np.asarray(first + second - both - both.T)
 

@@ -18,6 +18,8 @@ Mask = NDArray[np.bool_]
 LATERAL_ONLY = int(Flag.Z_AMBIGUOUS | Flag.NO_Z | Flag.Z_OUT_OF_RANGE)
 #: Standard deviation that stands for no knowledge of z, m.
 UNKNOWN_Z = 10e-6
+#: Standard deviations outside this range, m, are no measurement of a particle's place.
+CREDIBLE = (10e-12, 10e-6)
 
 
 class Usable(NamedTuple):
@@ -48,7 +50,9 @@ def usable(localizations: Localizations, available: Mask | None = None) -> Usabl
     position, covariance, flags = localizations.position, localizations.covariance, localizations.flags
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     lateral = variance[:, 0] * variance[:, 1] - covariance[:, 0, 1] ** 2
-    keep = np.isfinite(position[:, :2]).all(axis=1) & (variance[:, 0] > 0) & (lateral > 0)
+    low, high = CREDIBLE[0] ** 2, CREDIBLE[1] ** 2
+    credible = (variance >= low) & (variance <= high)
+    keep = np.isfinite(position[:, :2]).all(axis=1) & credible[:, 0] & credible[:, 1] & (lateral > 0)
     keep &= np.isfinite(lateral) & ((flags & int(Flag.FIT_FAILED)) == 0)
     if available is not None:
         keep &= available
@@ -57,7 +61,7 @@ def usable(localizations: Localizations, available: Mask | None = None) -> Usabl
     a, b, c = covariance[:, 0, 1], covariance[:, 0, 2], covariance[:, 1, 2]
     xx, yy, zz = variance[of].T
     determinant = zz * lateral[of] - xx * c**2 - yy * b**2 + 2 * a * b * c
-    has_z = np.isfinite(position[:, 2]) & np.isfinite(determinant) & (determinant > 0) & (zz > 0)
+    has_z = np.isfinite(position[:, 2]) & (determinant > 0) & credible[of, 2]
     has_z &= (flags & LATERAL_ONLY) == 0
     position[~has_z, 2] = 0.0
     covariance[~has_z, 2, :] = covariance[~has_z, :, 2] = 0.0

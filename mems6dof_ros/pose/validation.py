@@ -289,7 +289,7 @@ def figures(
     drift_cycles: int = 2000,
     optical_cycles: int = 0,
 ) -> list[Figure]:
-    """The table: everything above, on all ``seeds``; ``optical_cycles`` (three seeds) 0: no rendered frames."""
+    """The table: everything above on all ``seeds``, rendered frames (``optical_cycles`` > 0) on three."""
     parts: list[Callable[[], list[Figure]]] = [
         lambda: _accuracy(seeds),
         lambda: _drift(seeds[:2], drift_cycles),

@@ -129,8 +129,8 @@ def test_chained_registration_works_and_is_worse():
     assert sum(run.lost + run.wrong_identities + run.wrong_poses for run in chained) == 0
     late = [np.mean([run.comparison().error[80:, 5] ** 2 for run in runs]) for runs in (chained, mapped)]
     assert late[0] > 1.2 * late[1]
-    # Honest: never too sure of itself, and not ten times too modest as a plain sum of increments would be. The
-    # fitted constants swallow part of a random walk, hence below 1.
+    # Never too sure of itself, and not ten times too modest as a plain sum of increments would be. The fitted
+    # constants swallow part of a random walk, hence below 1.
     assert all(0.15 < run.comparison().nees_per_dof < 1.2 for run in chained)
 
 
@@ -289,6 +289,37 @@ def test_bad_localizations_are_left_out_or_lost_with_a_reason():
     assert (pose.particle_id[5:10] >= 0).sum() >= 4  # one may just have entered the field
     assert np.isnan(pose.residual[5:10, 2]).all()
     assert np.isfinite(pose.covariance).all()
+
+
+@pytest.mark.parametrize("reference", ["map", "previous"])
+@pytest.mark.parametrize("seed", range(5))
+def test_garbage_never_raises_and_valid_poses_have_covariances(seed, reference):
+    random = np.random.default_rng(seed)
+    scene = Scene(particles=40, missing=0.2, spurious=0.2, wrong_z=0.2)
+    gear, estimator = SyntheticGear(scene, seed), PoseEstimator(PoseSettings(reference=reference))
+    for cycle in range(40):
+        gear.advance()
+        seen, _ = gear.observe()
+        position, covariance, n = seen.position.copy(), seen.covariance.copy(), len(seen)
+        spoil = [
+            lambda p, c: (p * 0 + p[:1], c),
+            lambda p, c: (p * [1, 0, 1], c),
+            lambda p, c: (np.where(random.random(p.shape) < 0.3, np.nan, p), c),
+            lambda p, c: (p, c * 10 ** random.uniform(-12, 12)),
+            lambda p, c: (random.normal(0, 1e-4, p.shape), c),
+            lambda p, c: (p * 1e3, c),
+            lambda p, c: (p, c + 1e-16 * random.normal(size=(3, 3))),
+            lambda p, c: (p, c),
+            lambda p, c: (p, c),
+        ][random.integers(9)]
+        if n and cycle:
+            position, covariance = spoil(position, covariance)
+        pose = estimator.update(replace(seen, position=position, covariance=covariance))
+        if pose.valid:
+            assert np.isfinite(pose.covariance).all()
+            assert (np.diag(pose.displacement_covariance) > 0).all()
+        else:
+            assert pose.reason
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

@@ -65,7 +65,7 @@ def one_bead_left_out(stack: FocusStack, reach: float, orders: Orders | None, me
         found = calibration.locate(bead.fits)
         z = found.position[:, 2] + bead.stage_z
         near = np.abs(bead.stage_z - bead.stage_z[bead.in_focus]) <= reach
-        seen += np.count_nonzero(near)
+        seen += int(np.count_nonzero(near))
         near &= found.flags == 0
         error.append(z[near] - np.mean(z[near]) if near.any() else z[near])
         sd.append(np.sqrt(found.covariance[near, 2, 2]))

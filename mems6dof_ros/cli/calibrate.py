@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from mems6dof_ros.errors import InputError
-from mems6dof_ros.frame import Frame
-from mems6dof_ros.localization.camera import CameraNoise
+from mems6dof_ros.cli.inputs import add_camera_options, add_image_options, camera_of, open_input
 
 WINDOW_PX = 41
 WEIGHTING = "relative_light_weighting"
@@ -27,17 +22,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("stacks", nargs="+", metavar="STACK", help="bag, TIFF stack or folder of images")
     parser.add_argument("--out", type=Path, required=True, help="calibration file to write (YAML)")
     parser.add_argument("--report", type=Path, help="HTML report (default: beside the calibration file)")
-    stack = parser.add_argument_group("stacks of images")
-    stack.add_argument("--step", type=float, default=math.nan, help="stage step between images, m")
-    stack.add_argument("--pixel-size", type=float, default=math.nan, help="pixel size in object space, m")
-    stack.add_argument(
+    parser.add_argument(
         "--rotation", type=float, nargs="+", metavar="RAD", help="the substrate's orientation in each stack"
     )
-    camera = parser.add_argument_group("camera, where the input does not know it")
-    camera.add_argument("--offset", type=float, help="pixel value without light, ADU")
-    camera.add_argument("--gain", type=float, help="ADU per electron")
-    camera.add_argument("--read-noise", type=float, help="electrons rms")
-    camera.add_argument("--saturation", type=float, help="ADU (default: the largest pixel value)")
+    add_image_options(parser)
+    add_camera_options(parser)
     fit = parser.add_argument_group("fit and model")
     fit.add_argument(
         "--window", type=int, default=WINDOW_PX, help="side of the window, px (default: %(default)s)"
@@ -57,13 +46,15 @@ def run(args: argparse.Namespace) -> int:
     from mems6dof_ros.calibration.focus_stack import measure_stack
     from mems6dof_ros.calibration.report import write_report
     from mems6dof_ros.cli.progress import Progress
+    from mems6dof_ros.sources.source import frames
 
     stacks = []
     for number, path in enumerate(args.stacks):
-        frames, camera = open_stack(path, args)
+        source = open_input(Path(path), args)
+        camera = camera_of(args, source.info, None)
         with Progress(f"stack {number + 1} of {len(args.stacks)}, plane") as progress:
             stacks.append(
-                measure_stack(frames, camera, args.weighting, args.window, Path(path).name, progress)
+                measure_stack(frames(source), camera, args.weighting, args.window, Path(path).name, progress)
             )
     rotations = None if args.rotation is None else tuple(args.rotation)
     settings = CalibrationSettings(
@@ -89,34 +80,6 @@ def run(args: argparse.Namespace) -> int:
     print(args.out)
     print(report)
     return 0
-
-
-def open_stack(path: str, args: argparse.Namespace) -> tuple[Iterator[Frame], CameraNoise]:
-    """Frames of the stack at ``path`` and the noise of their camera, from the input or the options."""
-    from mems6dof_ros.sources.source import frames, open_source
-
-    options: dict[str, Any] = {"path": path}
-    kind = "bag" if Path(path).suffix == ".mcap" or (Path(path) / "metadata.yaml").exists() else "images"
-    if kind == "images":
-        options |= {"step": args.step, "pixel_size": args.pixel_size}
-    source = open_source(kind, **options)
-    camera = source.info.camera
-    given = {
-        "offset_adu": args.offset,
-        "gain_adu_per_electron": args.gain,
-        "read_noise_electrons": args.read_noise,
-        "saturation_adu": args.saturation,
-    }
-    stated = {name: value for name, value in given.items() if value is not None}
-    if camera is not None:
-        return frames(source), replace(camera, **stated)
-    stated.setdefault("saturation_adu", 255 if source.info.encoding == "mono8" else 65535)
-    missing = [name for name in given if name not in stated]
-    if missing:
-        raise InputError(
-            path, f"no camera numbers ({', '.join(missing)})", "--offset, --gain and --read-noise"
-        )
-    return frames(source), CameraNoise(**stated)
 
 
 def _counts(reasons: Iterator[str]) -> dict[str, int]:

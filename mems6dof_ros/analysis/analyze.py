@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -14,6 +16,7 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame, GroundTruth
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.localization.localizer import Localizer
+from mems6dof_ros.pose.bodies import Bodies
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages, topics
@@ -55,22 +58,27 @@ def analyze(
     provenance: Mapping[str, str] | None = None,
     attachments: Mapping[str, bytes] | None = None,
     keep_images: bool = False,
+    workers: int = 1,
     progress: Progress = lambda done, total: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Summary:
-    """Measure all frames of ``source``; write ``bag/``, ``cycles.csv``, ``localizations.csv`` into ``out``.
+    """Measure all frames of ``source``; write ``bag/``, ``cycles.csv``, ``localizations.csv`` into ``out``,
+    and ``BODY_constellation.json`` for each body, by which another session may recognise it.
 
     Nothing in the results depends on when or how fast it runs: latencies stay unknown, and messages are
-    recorded at the stamps of their frames. A frame that cannot be used is left out and its reason kept,
-    but the first one must be usable. ``stopped`` is asked between frames; what is done by then is complete.
-    Raises InputError for an ``out`` that is not empty, and for the first frame.
+    recorded at the stamps of their frames. ``workers`` frames are localized at a time, with the same
+    results; poses build on each other and follow in order. A frame that cannot be used is left out and its
+    reason kept, but the first one must be usable. ``stopped`` is asked between frames; what is done by
+    then is complete. Raises InputError for an ``out`` that is not empty, for ``workers`` below 1,
+    for bodies that cannot be told apart, and for the first frame.
     """
+    if workers < 1:
+        raise InputError("workers", f"{workers}", "1 or more")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), "something there already", "a new or empty directory")
     summary = Summary()
-    source.start()
-    try:
-        measured = _measured(source, localizer, summary.refused)
+    bodies = Bodies(estimators) if estimators else None
+    with contextlib.closing(_measured(source, localizer, workers, summary.refused)) as measured:
         # The first frame is measured before anything is created: most mistakes show there.
         first = next(measured, None)
         if first is None:
@@ -89,7 +97,7 @@ def analyze(
             for name, data in (attachments or {}).items():
                 bag.attach(name, data)
             for frame, found in chain([first], measured):
-                poses = [estimator.update(found) for estimator in estimators]
+                poses = bodies.update(found) if bodies else []
                 _write(bag, frame, found, poses, keep_images)
                 for pose in poses:
                     cycles.write(pose)
@@ -103,8 +111,8 @@ def analyze(
                 if stopped():
                     summary.interrupted = True
                     break
-    finally:
-        source.stop()
+        for estimator in estimators:
+            _keep_constellation(estimator, out)
     return summary
 
 
@@ -118,6 +126,10 @@ def settings_of(localizer: Localizer, estimators: Sequence[PoseEstimator]) -> di
     }
     for estimator in estimators:
         settings[f"pose_of_{estimator.body}"] = json.dumps(asdict(estimator.settings))
+        if estimator.region is not None:
+            settings[f"region_of_{estimator.body}"] = json.dumps(asdict(estimator.region))
+        if estimator.reference is not None:
+            settings[f"particles_known_of_{estimator.body}"] = str(len(estimator.reference.ids))
     return settings
 
 
@@ -134,23 +146,50 @@ def sha256_of(path: Path) -> str:
 
 
 def _measured(
-    source: FrameSource, localizer: Localizer, refused: list[str]
-) -> Iterator[tuple[Frame, Localizations]]:
+    source: FrameSource, localizer: Localizer, workers: int, refused: list[str]
+) -> Generator[tuple[Frame, Localizations], None, None]:
     """Frames with their localizations; after the first, those that cannot be used become reasons."""
     usable = False
-    while True:
+    with contextlib.closing(_results(source, localizer, workers)) as results:
+        for result in results:
+            try:
+                frame, found = result()
+            except InputError as error:
+                if not usable:
+                    raise
+                refused.append(str(error))
+                continue
+            usable = True
+            yield frame, found
+
+
+def _results(
+    source: FrameSource, localizer: Localizer, workers: int
+) -> Generator[Callable[[], tuple[Frame, Localizations]], None, None]:
+    """For each frame, in order, what returns it with its localizations or raises its InputError.
+
+    One thread reads, ``workers`` localize: compiled kernels, OpenCV and decompression leave the interpreter
+    to others. One thread from beginning to end reads, because some files insist on that.
+    """
+    pending: deque[Future[tuple[Frame, Localizations] | None]] = deque()
+
+    def measure(read: Future[Frame | None]) -> tuple[Frame, Localizations] | None:
+        frame = read.result()
+        return None if frame is None else (frame, localizer.localize(frame))
+
+    ahead = workers if workers > 1 else 0  # frames under way behind the one that is waited for
+    with ThreadPoolExecutor(1, "reader") as reader, ThreadPoolExecutor(workers, "localizer") as pool:
+        reader.submit(source.start).result()
         try:
-            frame = source.read()
-            if frame is None:
-                return
-            found = localizer.localize(frame)
-        except InputError as error:
-            if not usable:
-                raise
-            refused.append(str(error))
-            continue
-        usable = True
-        yield frame, found
+            while True:
+                while len(pending) <= ahead:
+                    pending.append(pool.submit(measure, reader.submit(source.read)))
+                first = pending.popleft()
+                if first.exception() is None and first.result() is None:
+                    return
+                yield first.result  # type: ignore[misc]
+        finally:
+            reader.submit(source.stop).result()
 
 
 def _write(
@@ -166,6 +205,14 @@ def _write(
             bag.write_message(f"/{topics.POSE}", messages.pose_stamped(pose), frame.stamp_ns)
             covariant = messages.pose_with_covariance_stamped(pose)
             bag.write_message(f"/{topics.POSE_WITH_COVARIANCE}", covariant, frame.stamp_ns)
+
+
+def _keep_constellation(estimator: PoseEstimator, out: Path) -> None:
+    """Unless nothing is known that a body could be recognised by."""
+    if estimator.constellation is not None:
+        known = estimator.snapshot()
+        if len(known.ids) >= estimator.settings.min_particles:
+            known.save(out / f"{estimator.body}_constellation.json")
 
 
 def _count(summary: Summary, frame: Frame, found: Localizations, poses: Sequence[CyclePose]) -> None:

@@ -74,9 +74,10 @@ def test_against_truth(results):
     assert 0.4 < comparison.nees_per_dof < 2
 
 
-def test_a_second_run_gives_the_same_to_the_last_digit(results, tmp_path):
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_second_run_gives_the_same_to_the_last_digit(results, tmp_path, workers):
     out, _ = results
-    run(tmp_path / "again", attachments={"calibration.yaml": b"the file"})
+    run(tmp_path / "again", attachments={"calibration.yaml": b"the file"}, workers=workers)
     for name in ("cycles.csv", "localizations.csv"):
         assert (out / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
     with BagReader(out / "bag") as a, BagReader(tmp_path / "again" / "bag") as b:

@@ -150,11 +150,11 @@ def _plot(
         blind, [move.target + move.error for move in opened], "x", color=ORANGE, label="gear, open loop"
     )
     above.set(xlabel="motion cycle", ylabel="psi, rad")
-    above.legend(loc="upper right", ncols=3)
     number = np.arange(1, len(closed) + 1)
     below.axhspan(0, tolerance * 1e3, color=GREY, alpha=0.3, lw=0, label="tolerance")
     below.semilogy(number, [abs(move.error) * 1e3 for move in closed], "o", color=BLUE, label="closed loop")
     below.semilogy(number, [abs(move.error) * 1e3 for move in opened], "x", color=ORANGE, label="open loop")
     below.set(xlabel="target", ylabel="|error| at the end, mrad", xticks=number)
-    below.legend(loc="upper left", ncols=3)
+    for axes in (above, below):  # beside the data, not on them
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
     figure.savefig(path, dpi=130)

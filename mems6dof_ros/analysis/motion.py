@@ -27,8 +27,8 @@ class CircularMotion:
     """A quantity in the plane that has a part turning with the body.
 
     ``mean`` (2,): fixed in the field; ``turning`` (2,): fixed to the body, at psi = 0 (eccentricity, or
-    tilt of the body on its axis); ``drift`` (2,) per cycle; ``sd_turning``: of each component of
-    ``turning``; ``play`` (n, 2): what remains; ``turns``: revolutions covered. Below half a revolution
+    tilt of the body on its axis); ``drift`` (2,) per cycle; ``sd_turning``, ``sd_drift``: of each component;
+    ``play`` (n, 2): what remains; ``turns``: revolutions covered. Below half a revolution
     ``mean`` and ``turning`` are hardly told apart: ``sd_turning`` says so.
     """
 
@@ -36,6 +36,7 @@ class CircularMotion:
     turning: Array
     drift: Array
     sd_turning: float
+    sd_drift: float
     play: Array
     turns: float
 
@@ -55,11 +56,14 @@ class CircularMotion:
         return np.asarray(self.play.std(axis=0))
 
 
-def separate_turning(values: Array, psi: Array, with_drift: bool = True) -> CircularMotion:
-    """Least squares of ``values`` (n, 2) = mean + Rz(psi) turning + drift k + play; ``psi`` (n,).
+def separate_turning(
+    values: Array, psi: Array, cycle: NDArray[np.int64] | None = None, with_drift: bool = True
+) -> CircularMotion:
+    """Least squares of ``values`` (n, 2) = mean + Rz(psi) turning + drift k + play; ``psi`` (n,); ``cycle``
+    (n,), None: none is missing.
 
-    Drift is left out below one revolution, where it cannot be told from the turning part. Raises InputError
-    for fewer than 8 cycles.
+    Drift is left out below one revolution, where it cannot be told from the turning part. The standard
+    deviations are those of play that remembers the cycle before. Raises InputError for fewer than 8 cycles.
     """
     n = len(psi)
     if n < 8:
@@ -67,7 +71,7 @@ def separate_turning(values: Array, psi: Array, with_drift: bool = True) -> Circ
     turns = float(np.ptp(psi) / math.tau)
     with_drift = with_drift and turns >= 1
     c, s, one, zero = np.cos(psi), np.sin(psi), np.ones(n), np.zeros(n)
-    k = np.arange(n) - (n - 1) / 2
+    k = _counted(cycle, n)
     x_rows = [one, zero, c, -s] + ([k, zero] if with_drift else [])
     y_rows = [zero, one, s, c] + ([zero, k] if with_drift else [])
     design = np.concatenate([np.column_stack(x_rows), np.column_stack(y_rows)])
@@ -75,12 +79,34 @@ def separate_turning(values: Array, psi: Array, with_drift: bool = True) -> Circ
     solution, _, rank, _ = np.linalg.lstsq(design, target, rcond=1e-9)
     left = target - design @ solution
     variance = float(left @ left) / max(2 * n - rank, 1)
-    normal = design.T @ design
-    sd = math.sqrt(variance * float(np.linalg.pinv(normal, rcond=1e-12)[2, 2]))
-    if rank < design.shape[1]:
-        sd = math.inf
-    drift = solution[4:6] if with_drift else np.zeros(2)
-    return CircularMotion(solution[:2], solution[2:4], drift, sd, left.reshape(2, n).T, turns)
+    play = left.reshape(2, n).T
+    spread = variance * memory_factor(play) * np.diag(np.linalg.pinv(design.T @ design, rcond=1e-12))
+    sd = math.sqrt(spread[2]) if rank == design.shape[1] else math.inf
+    drift, sd_drift = (solution[4:6], math.sqrt(spread[4])) if with_drift else (np.zeros(2), math.inf)
+    return CircularMotion(solution[:2], solution[2:4], drift, sd, sd_drift, play, turns)
+
+
+def memory_factor(play: Array) -> float:
+    """By how much the variance of slow quantities fitted to ``play`` (n, d) exceeds that of white noise.
+
+    The power of a first-order autoregressive process at low frequency, (1 + r) / (1 - r), r being the
+    correlation from one cycle to the next where that is positive (Bartlett 1946).
+    """
+    total = float((play**2).sum())
+    r = float((play[1:] * play[:-1]).sum()) / total if total else 0.0
+    return (1 + min(r, 0.95)) / (1 - min(r, 0.95)) if r > 0 else 1.0
+
+
+def without_trend(values: Array, cycle: NDArray[np.int64] | None = None) -> Array:
+    """``values`` (n,) less the straight line through them over ``cycle`` (n,), None: none is missing."""
+    k = _counted(cycle, len(values))
+    return np.asarray(values - np.polyval(np.polyfit(k, values, 1), k))
+
+
+def _counted(cycle: NDArray[np.int64] | None, n: int) -> Array:
+    """Cycles from the mean."""
+    k = np.arange(n) if cycle is None else cycle
+    return np.asarray(k - k.mean())
 
 
 @dataclass(frozen=True)
@@ -175,15 +201,19 @@ class Repeatability:
 
 
 def repeatability(
-    displacement: Array, covariance: Array, psi: Array, tolerance: float = math.radians(1)
+    displacement: Array,
+    covariance: Array,
+    psi: Array,
+    cycle: NDArray[np.int64] | None = None,
+    tolerance: float = math.radians(1),
 ) -> Repeatability:
     """Compare ``displacement`` (n, 6) one or more revolutions apart where psi agrees within ``tolerance``
-    rad; psi itself is compared with its own trend, a straight line over the cycles. ``covariance`` (n, 6, 6).
-    Raises InputError where no two cycles are that close."""
-    n = len(psi)
+    rad; psi itself is compared with its trend, a straight line over ``cycle`` (n,), None: none is missing.
+    ``covariance`` (n, 6, 6). Raises InputError where no two cycles are that close."""
+    if len(psi) < 2:
+        raise InputError("repeatability", "no two cycles at equal psi", "two revolutions or more")
     values = displacement.copy()
-    k = np.arange(n)
-    values[:, 5] = psi - np.polyval(np.polyfit(k, psi, 1), k)
+    values[:, 5] = without_trend(psi, cycle)
     difference = psi[None, :] - psi[:, None]
     turn = np.rint(difference / math.tau)
     near = (np.abs(difference - math.tau * turn) < tolerance) & (turn >= 1)
@@ -211,17 +241,21 @@ class UncertaintyBudget:
 
 
 def uncertainty_budget(
-    displacement: Array, covariance: Array, increment_covariance: Array, psi_detrended: bool = True
+    displacement: Array,
+    covariance: Array,
+    increment_covariance: Array,
+    cycle: NDArray[np.int64] | None = None,
 ) -> UncertaintyBudget:
     """Budget from ``displacement`` (n, 6), its ``covariance`` (n, 6, 6) and that of the increments (n, 6, 6),
-    which hold the noise of two cycles and nothing common (see docs/definitions.md)."""
+    which hold the noise of two cycles and nothing common (see docs/definitions.md); NaN without increments.
+    The motion of psi is that about its trend over ``cycle`` (n,), None: none is missing."""
     total = np.diagonal(covariance, axis1=1, axis2=2)
     twice = np.diagonal(increment_covariance, axis1=1, axis2=2)
-    noise = np.nanmean(twice, axis=0) / 2
+    known = np.isfinite(twice).all(axis=1)
+    noise = twice[known].mean(axis=0) / 2 if known.any() else np.full(6, np.nan)
     values = displacement.copy()
-    if psi_detrended:
-        k = np.arange(len(values))
-        values[:, 5] -= np.polyval(np.polyfit(k, values[:, 5], 1), k)
+    if len(values) > 1:
+        values[:, 5] = without_trend(values[:, 5], cycle)
     mean = total.mean(axis=0)
     return UncertaintyBudget(
         np.sqrt(noise), np.sqrt(np.maximum(mean - noise, 0)), np.sqrt(mean), values.std(axis=0)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mems6dof_ros.cli.inputs import add_camera_options, add_image_options, camera_of, open_input
+from mems6dof_ros.errors import InputError
 
 if TYPE_CHECKING:
     from mems6dof_ros.analysis.analyze import Summary
@@ -26,7 +29,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help="directory to create")
     parser.add_argument("--method", help="method of reading z (default: what the calibration proposes)")
-    parser.add_argument("--body", default="load_gear", help="name of the rigid body (default: %(default)s)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--body", default="load_gear", help="name of the rigid body (default: %(default)s)")
+    which.add_argument(
+        "--bodies",
+        type=Path,
+        metavar="FILE",
+        help="YAML file of several bodies: of each the region or constellation (docs/files.md)",
+    )
     parser.add_argument(
         "--reference",
         choices=("map", "previous"),
@@ -34,6 +44,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="register to the constellation map (default) or to the previous micrograph",
     )
     parser.add_argument("--keep-images", action="store_true", help="write the images into the new bag too")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="frames localized at a time (default: %(default)s)"
+    )
     add_image_options(parser)
     add_camera_options(parser)
     parser.set_defaults(run=run)
@@ -46,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from mems6dof_ros.cli.interrupt import stop_on_signal
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.localization.localizer import Localizer
+    from mems6dof_ros.pose.bodies_file import load_bodies
     from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings
 
     calibration, attachments = None, {}
@@ -55,7 +69,12 @@ def run(args: argparse.Namespace) -> int:
     source = open_input(args.input, args)
     camera = camera_of(args, source.info, calibration.camera if calibration else None)
     localizer = Localizer(camera, calibration)
-    estimators = [PoseEstimator(PoseSettings(reference=args.reference), args.body)] if calibration else []
+    settings = PoseSettings(reference=args.reference)
+    estimators: Sequence[PoseEstimator] = [PoseEstimator(settings, args.body)] if calibration else []
+    if args.bodies:
+        if not calibration:
+            raise InputError("--bodies", "no calibration", "a calibration: without one there are no poses")
+        estimators = load_bodies(args.bodies, settings).estimators
     provenance = {"input": args.input.name, "input_sha256": sha256_of(args.input)}
     with Progress("frames") as progress, stop_on_signal() as stopped:
         summary = analyze(
@@ -66,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
             provenance=provenance,
             attachments=attachments,
             keep_images=args.keep_images,
+            workers=args.workers,
             progress=progress,
             stopped=stopped,
         )
@@ -75,18 +95,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(summary: Summary) -> list[str]:
-    from mems6dof_ros.analysis.truth import compare
-
     lines = [f"frames {summary.frames}, localizations {summary.localizations}"]
     lines += [f"refused {reason}" for reason in summary.refused]
     if summary.interrupted:
         lines.append("interrupted: the frames so far are complete")
-    if summary.poses:
-        counts = ", ".join(f"{status} {count}" for status, count in sorted(summary.statuses.items()))
-        lines.append(f"poses: {counts}")
-    pairs = [(p, t) for p, t in zip(summary.poses, summary.truths, strict=True) if t is not None and p.valid]
-    if pairs:
-        comparison = compare([pose for pose, _ in pairs], [truth for _, truth in pairs])
+    for body in dict.fromkeys(pose.body for pose in summary.poses):
+        lines += _lines_of_body(summary, body)
+    return lines
+
+
+def _lines_of_body(summary: Summary, body: str) -> list[str]:
+    from mems6dof_ros.analysis.truth import compare
+
+    pairs = [pair for pair in zip(summary.poses, summary.truths, strict=True) if pair[0].body == body]
+    counts = Counter(pose.status.name.lower() for pose, _ in pairs)
+    lines = [f"{body} poses: " + ", ".join(f"{status} {count}" for status, count in sorted(counts.items()))]
+    known = [(pose, truth) for pose, truth in pairs if truth is not None and pose.valid]
+    if known:
+        comparison = compare([pose for pose, _ in known], [truth for _, truth in known])
         lines.append(f"{'against truth':14}{'rms error':>12}{'claimed':>12}")
         for name, error, claimed in comparison.table():
             unit, scale = ("nm", 1e9) if name in ("dx", "dy", "dz") else ("urad", 1e6)

@@ -1,0 +1,100 @@
+"""Which rigid bodies a recording shows: a YAML file to one PoseEstimator for each.
+
+```yaml
+bodies:
+  load_gear:
+    region: {centre: [-100.0e-6, 0], outer_radius: 170.0e-6}      # m, microscope frame
+  ring_gear:
+    region: {centre: [474.0e-6, 0], outer_radius: 420.0e-6, inner_radius: 300.0e-6}
+    constellation: ring_gear_constellation.json                   # of an earlier session; beside this file
+    settings: {field_degree: 0}                                   # fields of PoseSettings
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mems6dof_ros.errors import InputError
+from mems6dof_ros.pose.bodies import Bodies
+from mems6dof_ros.pose.constellation_file import ReferenceConstellation
+from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.pose.settings import PoseSettings, Region
+
+_OF_A_BODY = ("region", "constellation", "settings")
+
+
+def load_bodies(path: Path, settings: PoseSettings | None = None) -> Bodies:
+    """The estimators that ``path`` describes, in its order; ``settings`` where it sets nothing of its own.
+
+    Raises InputError for anything but the form above, and for bodies that cannot be told apart.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(str(path), error.strerror or "an unreadable file", "a file of bodies") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "no valid YAML", "a file of bodies") from error
+    bodies = _mapping(content, str(path), ("bodies",)).get("bodies")
+    if not isinstance(bodies, dict) or not bodies:
+        raise InputError(str(path), "no bodies", "'bodies:' with one entry for each")
+    return Bodies(
+        [_estimator(str(name), entry, path, settings or PoseSettings()) for name, entry in bodies.items()]
+    )
+
+
+def _estimator(name: str, entry: Any, path: Path, settings: PoseSettings) -> PoseEstimator:
+    where = f"{path}: body {name}"
+    entry = _mapping(entry, where, _OF_A_BODY)
+    own = _mapping(entry.get("settings"), f"{where}: settings", [item.name for item in fields(PoseSettings)])
+    values = {key: _setting(value, f"{where}: {key}") for key, value in own.items()}
+    region = reference = None
+    if "region" in entry:
+        region = _region(entry["region"], f"{where}: region")
+    if "constellation" in entry:
+        reference = ReferenceConstellation.load(path.parent / str(entry["constellation"]))
+    return PoseEstimator(replace(settings, **values), name, region, reference)
+
+
+def _region(entry: Any, where: str) -> Region:
+    entry = _mapping(entry, where, [item.name for item in fields(Region)])
+    centre = entry.get("centre")
+    if not isinstance(centre, list) or len(centre) != 2 or "outer_radius" not in entry:
+        raise InputError(where, repr(entry), "centre [x, y] and outer_radius, in m")
+    x, y = (_number(value, f"{where}: centre") for value in centre)
+    radii = {key: _number(value, f"{where}: {key}") for key, value in entry.items() if key != "centre"}
+    return Region((x, y), **radii)
+
+
+def _setting(value: Any, where: str) -> Any:
+    """As PoseSettings takes it, which checks it: lists as tuples of numbers."""
+    if isinstance(value, list):
+        return tuple(_number(item, where) for item in value)
+    if isinstance(value, int) or value in ("map", "previous"):
+        return value
+    return _number(value, where)
+
+
+def _number(value: Any, where: str) -> float:
+    """YAML 1.1 takes 170e-6, without a point, for text."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(where, repr(value), "a number") from None
+
+
+def _mapping(value: Any, where: str, names: Any) -> Mapping[str, Any]:
+    """``value`` as a mapping with no other keys than ``names``; nothing is an empty one."""
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise InputError(where, repr(value), f"a mapping of {', '.join(names)}")
+    for key in value:
+        if key not in names:
+            raise InputError(where, f"unknown {key!r}", f"one of {', '.join(names)}")
+    return value

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 import rclpy
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -47,6 +48,24 @@ WAIT_PARAMETER = Parameter(
 )
 
 
+class WhileRoom(CallbackGroup):
+    """For subscriptions that feed a worker: while its queue would block, their messages stay in the
+    middleware, and everything else the node does goes on."""
+
+    def __init__(self, worker: Worker[Any]) -> None:
+        super().__init__()
+        self._worker = worker
+
+    def can_execute(self, entity: Any) -> bool:
+        return self._worker.accepts()
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return self._worker.accepts()
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
 class InstrumentNode(Node):
     """A node with declared parameters, ``values`` by name, ``health``, and perhaps a ``worker``.
 
@@ -61,9 +80,11 @@ class InstrumentNode(Node):
         self.finished = threading.Event()
         self.failure: BaseException | None = None
 
-    def start_worker(self, work: Callable[[Any], None]) -> Worker[Any]:
-        """The node's worker, with the queue that the parameters describe."""
-        self.worker = Worker(work, self.values["queue_size"], self.values["queue_policy"])
+    def start_worker(self, work: Callable[[Any], None], capacity: int | None = None) -> Worker[Any]:
+        """The node's worker, with the queue that the parameters describe, or of ``capacity``."""
+        capacity = capacity or self.values["queue_size"]
+        wake = self.create_guard_condition(lambda: None)
+        self.worker = Worker(work, capacity, self.values["queue_policy"], wake.trigger)
         self.health.gauge("queue", self.worker.__len__)
         return self.worker
 

@@ -31,7 +31,7 @@ from mems6dof_ros.localization.fitting import WEIGHTINGS
 from mems6dof_ros.localization.localizations import FIT_PARAMETERS, GaussianFits, Latency, Localizations
 from mems6dof_ros.localization.localizer import Localizer, LocalizerSettings
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
+from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
 from mems6dof_ros.recording import messages, topics
@@ -88,8 +88,8 @@ class LocalizerNode(InstrumentNode):
         super().__init__("localizer", PARAMETERS)
         self._localizer = make_localizer(self.values)
         self._matcher = FrameMatcher()
-        self._count = 0
-        self._last_counter: int | None = None
+        self._last = -1, -1  # frame counter and cycle of the frame before
+        self._dropped = 0
         self._localizations = self.create_publisher(
             LocalizationsMessage, topics.LOCALIZATIONS, transport.MESSAGES
         )
@@ -106,8 +106,11 @@ class LocalizerNode(InstrumentNode):
 
     def _subscribe(self) -> None:
         self.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES)
-        self.create_subscription(Image, topics.IMAGE, self._on_image, transport.FRAMES)
-        self.create_timer(0.1, self._forward, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        assert self.worker is not None
+        self.create_subscription(
+            Image, topics.IMAGE, self._on_image, transport.FRAMES, callback_group=WhileRoom(self.worker)
+        )
+        self.create_timer(0.1, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.tell("ready")
 
     def _on_info(self, info: FrameInfo) -> None:
@@ -118,11 +121,15 @@ class LocalizerNode(InstrumentNode):
         self._matcher.add_image(messages.nanoseconds(image.header.stamp), image, time.time_ns())
         self._forward()
 
+    def _on_tick(self) -> None:
+        self._matcher.tick()
+        self._forward()
+
     def _forward(self) -> None:
         """Hand on what is complete."""
         assert self.worker is not None
-        expected = self.count_publishers(topics.FRAME_INFO) > 0
-        for arrived in self._matcher.take(time.time_ns(), expected):
+        expected = self._matcher.informed or self.count_publishers(topics.FRAME_INFO) > 0
+        for arrived in self._matcher.take(expected):
             if arrived.info is None and expected:
                 self.health.count("frames without frame_info")
             self.worker.put(arrived)
@@ -155,21 +162,19 @@ class LocalizerNode(InstrumentNode):
 
     def _account(self, info: FrameInfo | None) -> tuple[int, int, int]:
         """Frame counter, motion cycle, and frames lost since the last frame."""
-        dropped = self.worker.dropped if self.worker else 0
+        assert self.worker is not None
+        dropped, self._dropped = self.worker.dropped - self._dropped, self.worker.dropped
+        last_counter, last_cycle = self._last
         if info is None:
             # A camera that publishes only images: count ourselves, one motion cycle per frame.
-            counter = cycle = self._count + dropped
-            self._count += 1
+            counter, cycle = last_counter + 1 + dropped, last_cycle + 1 + dropped
         else:
             counter, cycle = int(info.frame_counter), int(info.cycle)
-        last, self._last_counter = self._last_counter, counter
-        lost = counter - last - 1 if last is not None and counter > last else 0
-        on_the_way = lost - (info.frames_dropped if info else 0)
-        if on_the_way > 0:
-            self.health.lost(
-                on_the_way,
-                f"{on_the_way} frames lost before frame {counter} ({dropped} in this queue so far)",
-            )
+        self._last = counter, cycle
+        lost = max(counter - last_counter - 1, 0) if last_counter >= 0 else 0
+        if (on_the_way := lost - (info.frames_dropped if info else 0)) > 0:
+            of_which = f", {dropped} of them in this queue" if dropped else ""
+            self.health.lost(on_the_way, f"{on_the_way} frames lost before frame {counter}{of_which}")
         return counter, cycle, lost
 
 

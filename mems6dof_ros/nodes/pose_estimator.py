@@ -21,7 +21,7 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
+from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
@@ -90,8 +90,13 @@ class PoseEstimatorNode(InstrumentNode):
         self.when_ready(self.missing_subscribers(publishers), self._subscribe, lambda: rehearse(settings))
 
     def _subscribe(self) -> None:
+        assert self.worker is not None
         self.create_subscription(
-            LocalizationsMessage, topics.LOCALIZATIONS, self._on_localizations, transport.MESSAGES
+            LocalizationsMessage,
+            topics.LOCALIZATIONS,
+            self._on_localizations,
+            transport.MESSAGES,
+            callback_group=WhileRoom(self.worker),
         )
         self.tell("ready")
 

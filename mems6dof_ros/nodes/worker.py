@@ -16,9 +16,10 @@ DRAIN_TIMEOUT = 3.0
 class Worker(Generic[Item]):
     """A thread that takes items out of a bounded queue and calls ``work`` with each.
 
-    Callbacks only ``put``. ``policy`` when ``capacity`` items wait: ``block`` until there is room, or
-    ``drop_oldest`` and count it in ``dropped``. An exception of ``work`` ends the thread and is kept
-    in ``failure``.
+    Callbacks only ``put``. ``policy`` when the items that wait would exceed ``capacity``, in the unit of
+    their sizes: ``block`` until there is room, or ``drop_oldest`` and count them in ``dropped``. ``on_room``
+    is called when an item has been taken out of a full queue. An exception of ``work`` ends the thread and is
+    kept in ``failure``.
     """
 
     def __init__(
@@ -26,11 +27,13 @@ class Worker(Generic[Item]):
         work: Callable[[Item], None],
         capacity: int,
         policy: Literal["block", "drop_oldest"] = "block",
+        on_room: Callable[[], None] = lambda: None,
     ) -> None:
         self.dropped = 0
         self.failure: BaseException | None = None
-        self._work, self._capacity, self._policy = work, capacity, policy
-        self._items: deque[Item] = deque()
+        self._work, self._capacity, self._policy, self._on_room = work, capacity, policy, on_room
+        self._items: deque[tuple[Item, int]] = deque()
+        self._waiting = 0  # sizes of the items
         self._changed = threading.Condition()
         self._busy = self._ending = False
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
@@ -39,20 +42,30 @@ class Worker(Generic[Item]):
     def __len__(self) -> int:
         return len(self._items)
 
-    def put(self, item: Item) -> None:
-        """Append ``item``, see ``policy``; ignored once the worker has ended."""
+    def accepts(self) -> bool:
+        """False while ``put`` would block."""
+        return self._policy != "block" or self._ending or self._waiting < self._capacity
+
+    def put(self, item: Item, size: int = 1) -> None:
+        """Append ``item``, see ``policy``; ignored once the worker has ended.
+
+        An item greater than the capacity waits, or goes, alone.
+        """
         with self._changed:
-            if self._policy == "drop_oldest" and len(self._items) >= self._capacity:
-                self._items.popleft()
-                self.dropped += 1
-            while len(self._items) >= self._capacity and not self._ending:
-                self._changed.wait()
+            while self._items and self._waiting + size > self._capacity and not self._ending:
+                if self._policy == "drop_oldest":
+                    self._take()
+                    self.dropped += 1
+                else:
+                    self._changed.wait()
             if not self._ending:
-                self._items.append(item)
+                self._items.append((item, size))
+                self._waiting += size
                 self._changed.notify_all()
 
-    def end(self, timeout: float = DRAIN_TIMEOUT) -> int:
-        """Let the worker finish what is queued, for ``timeout`` s at most; returns how many items it left."""
+    def end(self, timeout: float | None = DRAIN_TIMEOUT) -> int:
+        """Let the worker finish what is queued, for ``timeout`` s at most, None: however long it takes;
+        returns how many items it left."""
         with self._changed:
             self._changed.wait_for(lambda: self._ending or not (self._items or self._busy), timeout)
             left = len(self._items) + self._busy
@@ -62,6 +75,11 @@ class Worker(Generic[Item]):
         self._thread.join(timeout=1.0)
         return left
 
+    def _take(self) -> Item:
+        item, size = self._items.popleft()
+        self._waiting -= size
+        return item
+
     def _run(self) -> None:
         try:
             while True:
@@ -69,9 +87,12 @@ class Worker(Generic[Item]):
                     self._changed.wait_for(lambda: self._items or self._ending)
                     if self._ending:
                         return
-                    item = self._items.popleft()
+                    was_full = self._waiting >= self._capacity
+                    item = self._take()
                     self._busy = True
                     self._changed.notify_all()
+                if was_full:
+                    self._on_room()
                 self._work(item)
                 with self._changed:
                     self._busy = False

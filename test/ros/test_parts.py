@@ -119,6 +119,23 @@ def test_worker_blocks_instead_of_losing() -> None:
     assert (done, worker.dropped) == (list(range(200)), 0)
 
 
+def test_worker_tells_when_there_is_room() -> None:
+    gate, room = threading.Semaphore(0), threading.Event()
+    worker = Worker(lambda _: gate.acquire(), capacity=1, on_room=room.set)
+    worker.put(0)
+    while len(worker):  # until the worker holds the first one
+        pass
+    assert worker.accepts()
+    worker.put(1)
+    assert not worker.accepts()
+    room.clear()
+    gate.release()
+    assert room.wait(10)
+    assert worker.accepts()
+    gate.release()
+    worker.end()
+
+
 def test_worker_that_fails_blocks_nobody() -> None:
     def work(item: int) -> None:
         raise ZeroDivisionError
@@ -143,33 +160,58 @@ def test_worker_says_what_it_left() -> None:
 
 
 def test_images_wait_for_their_info_in_order() -> None:
-    matcher = FrameMatcher(patience_ns=100)
-    matcher.add_image(1, "image 1", 0)
-    assert matcher.take(now_ns=50, infos_expected=True) == []
+    matcher = FrameMatcher()
+    matcher.add_image(1, "image 1", 10)
+    assert matcher.take(infos_expected=True) == []
     matcher.add_info(1, "info 1")
-    assert matcher.take(50, True) == [("image 1", "info 1", 0)]
+    assert matcher.take(True) == [("image 1", "info 1", 10)]
     matcher.add_info(2, "info 2")
     matcher.add_info(3, "info 3")
-    matcher.add_image(2, "image 2", 60)
-    matcher.add_image(3, "image 3", 61)
-    assert matcher.take(70, True) == [("image 2", "info 2", 60), ("image 3", "info 3", 61)]
+    matcher.add_image(2, "image 2", 20)
+    matcher.add_image(3, "image 3", 30)
+    assert matcher.take(True) == [("image 2", "info 2", 20), ("image 3", "info 3", 30)]
 
 
 def test_a_lost_info_holds_up_nobody() -> None:
-    matcher = FrameMatcher(patience_ns=100)
-    matcher.add_image(1, "image 1", 0)
-    matcher.add_image(2, "image 2", 10)
+    matcher = FrameMatcher(patience=2)
+    matcher.add_image(1, "image 1", 10)
+    matcher.add_image(2, "image 2", 20)
     matcher.add_info(2, "info 2")
-    assert matcher.take(20, True) == [("image 1", None, 0), ("image 2", "info 2", 10)]
+    assert matcher.take(True) == [("image 1", None, 10), ("image 2", "info 2", 20)]
+    matcher.tick()
     matcher.add_image(3, "image 3", 30)
-    assert matcher.take(130, True) == []
-    assert matcher.take(131, True) == [("image 3", None, 30)]
+    matcher.tick()
+    assert matcher.take(True) == []
+    matcher.tick()
+    assert matcher.take(True) == [("image 3", None, 30)]
+
+
+def test_infos_behind_their_images_are_waited_for() -> None:
+    """A backlog of infos, and images of which the older have been overwritten."""
+    matcher = FrameMatcher(patience=2)
+    matcher.add_image(9, "image 9", 0)
+    for stamp in range(1, 9):
+        matcher.add_info(stamp, f"info {stamp}")
+        matcher.tick()
+        assert matcher.take(True) == []
+    matcher.add_info(9, "info 9")
+    assert matcher.take(True) == [("image 9", "info 9", 0)]
+
+
+def test_stamps_may_begin_again() -> None:
+    matcher = FrameMatcher()
+    matcher.add_info(100, "info 100")
+    matcher.add_image(100, "image 100", 0)
+    matcher.take(True)
+    matcher.add_info(1, "info 1")
+    matcher.add_image(1, "image 1", 0)
+    assert matcher.take(True) == [("image 1", "info 1", 0)]
 
 
 def test_without_infos_images_pass_at_once() -> None:
     matcher = FrameMatcher()
     matcher.add_image(1, "image 1", 0)
-    assert matcher.take(0, infos_expected=False) == [("image 1", None, 0)]
+    assert matcher.take(infos_expected=False) == [("image 1", None, 0)]
 
 
 # Transport -------------------------------------------------------------------------------------------

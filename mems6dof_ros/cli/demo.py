@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 from mems6dof_ros.errors import InputError, Mems6dofError
 
 if TYPE_CHECKING:
-    from mems6dof_ros.analysis.recording import Recording
     from mems6dof_ros.analysis.truth import TruthComparison
     from mems6dof_ros.pose.cycle_pose import CyclePose
     from mems6dof_ros.simulation.settings import SimulationSettings
@@ -62,7 +61,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         description="Calibrate simulated optics from focus stacks, measure a turning gear through the four"
         " nodes as processes of their own, record, and compare every degree of freedom with truth.",
     )
-    parser.add_argument("--out", type=Path, default=Path("demo_output"), help="directory (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo_output"), help="directory (default: %(default)s)"
+    )
     parser.add_argument("--cycles", type=int, default=90, help="motion cycles; 80 are a revolution")
     parser.add_argument("--size", type=int, default=2048, help="width and height of the frames, px")
     parser.add_argument("--seed", type=int, default=1, help="particles, motion and noise")
@@ -135,7 +136,9 @@ def _calibrate(settings: SimulationSettings, path: Path, stopped: Any) -> None:
             stacks.append(measure_stack(counted(), camera_noise(settings), WEIGHTING, WINDOW_PX, name))
     result = calibrate(stacks, CalibrationSettings(rotations=ROTATIONS), lambda text: _say(f"     {text}"))
     save_calibration(result.calibration, path)
-    _say(f"     {len(result.beads)} beads, {len(result.rejected)} rejected, method {result.calibration.method}")
+    _say(
+        f"     {len(result.beads)} beads, {len(result.rejected)} rejected, method {result.calibration.method}"
+    )
 
 
 def _measure(
@@ -144,7 +147,7 @@ def _measure(
     """Run the nodes until every frame has become a pose; raises Mems6dofError where a node fails."""
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
-    from mems6dof_ros.nodes.system import chain, run_system, simulated
+    from mems6dof_ros.nodes.system import NodeSpec, chain, run_system, simulated
     from mems6dof_ros.nodes.watch import watch_poses
     from mems6dof_ros.recording import topics
 
@@ -155,6 +158,7 @@ def _measure(
         output=str(bag),
         recorded=[*DEFAULT_TOPICS, topics.IMAGE],
         compression="zstd",
+        monitor=NodeSpec("monitor", {"port": 0}),
     )
     with log.open("w", encoding="utf-8") as lines, Progress("     cycles") as progress:
 
@@ -163,6 +167,8 @@ def _measure(
 
         def on_line(line: str) -> None:
             print(line, file=lines, flush=True)
+            if line.startswith("[monitor] live page:"):
+                _say(f"     watch it in a browser: {line.rsplit(' ', 1)[-1]}")
 
         with watch_poses(on_pose) as spin, run_system(nodes, on_line=on_line) as running:
             while "frame_source" not in (ended := running.poll()) and not any(ended.values()):

@@ -24,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import InstrumentNode, run
+from mems6dof_ros.nodes.common import InstrumentNode, WhileRoom, run
 from mems6dof_ros.nodes.parameters import Parameter
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
@@ -65,7 +65,7 @@ PARAMETERS = (
     Parameter("sync_period", 1.0, "What is older survives a loss of power.", "s", (0.01, 3600.0)),
     Parameter("attachments", (), "Files to attach to the bag, for instance the calibration."),
     Parameter("autostart", True, "Begin to record by itself; otherwise at a call of ~/start."),
-    Parameter("queue_size", 1000, "Messages that wait for the disk.", "messages", (1, 1_000_000)),
+    Parameter("queue_mebibytes", 512, "Messages that wait for the disk.", "MiB", (1, 1_000_000)),
     Parameter(
         "queue_policy",
         "drop_oldest",
@@ -99,7 +99,8 @@ class RecorderNode(InstrumentNode):
                 raise InputError("parameter attachments", f"no file '{path}'", "existing files")
         if self.values["autostart"]:
             self._open()
-        self.start_worker(lambda act: act())
+        capacity = self.values["queue_mebibytes"] * 2**20
+        self.start_worker(lambda act: act(), capacity)
         self.create_service(Trigger, "~/start", self._on_start)
         # In a group of its own: it waits for messages that come meanwhile.
         self.create_service(Trigger, "~/stop", self._on_stop, callback_group=MutuallyExclusiveCallbackGroup())
@@ -116,6 +117,8 @@ class RecorderNode(InstrumentNode):
         while before != self.health.total("messages") and time.monotonic() < deadline:
             before = self.health.total("messages")
             spin(_QUIET)
+        assert self.worker is not None
+        self.worker.end(timeout=None)  # a slow disk is no reason to lose a record; a second signal is
         super().end(spin)
         self._close()
 
@@ -161,7 +164,9 @@ class RecorderNode(InstrumentNode):
         )
         channel = Channel(self.resolve_topic_name(name), typename, (offered,))
         receive = functools.partial(self._on_message, channel)
-        self.create_subscription(message_type, name, receive, qos, raw=True)
+        assert self.worker is not None
+        group = WhileRoom(self.worker)
+        self.create_subscription(message_type, name, receive, qos, raw=True, callback_group=group)
 
     def _on_message(self, channel: Channel, data: bytes, info: dict[str, Any]) -> None:
         assert self.worker is not None
@@ -176,7 +181,7 @@ class RecorderNode(InstrumentNode):
         )
         self.health.count("messages")
         self._account(received)
-        self.worker.put(functools.partial(self._write, received))
+        self.worker.put(functools.partial(self._write, received), len(data))
 
     def _account(self, received: _Received) -> None:
         """Count what the wire lost; with several publishers on a topic the numbers do not tell."""

@@ -85,8 +85,10 @@ def chain(
     compression: str = "none",
     controller: NodeSpec | None = None,
     watched: Sequence[str] = (),
+    monitor: NodeSpec | None = None,
 ) -> list[NodeSpec]:
-    """frame_source, localizer, pose_estimator, ``controller`` if any and, with an ``output``, recorder.
+    """frame_source, localizer, pose_estimator, ``controller`` if any, with an ``output`` recorder, and
+    ``monitor`` if any.
 
     ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for
     the subscribers that the table gives it, and for one more of each topic in ``watched``, so that nothing is
@@ -108,6 +110,8 @@ def chain(
             **attachments,
         }
         nodes.append(NodeSpec("recorder", recorder, remap))
+    if monitor:
+        nodes.append(replace(monitor, remappings=remap))
     subscribed = [*watched, *(topic for node in nodes for topic in _subscriptions(node))]
     return [_waiting_for_subscribers(node, subscribed) for node in nodes]
 
@@ -151,7 +155,7 @@ def _subscriptions(node: NodeSpec) -> Sequence[str]:
         return list(node.parameters["topics"])
     if node.executable == "frame_source":
         return [node.parameters["acknowledged_by"]] if node.parameters["pacing"] == "consumer" else []
-    return _SUBSCRIBED[node.executable]
+    return _SUBSCRIBED.get(node.executable, ())  # nobody waits for a monitor
 
 
 def _live(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -165,12 +169,13 @@ def _live(values: Mapping[str, str]) -> list[NodeSpec]:
         output=values["output"],
         queue_policy="drop_oldest",
         image_topic=values["image_topic"],
+        monitor=_monitor(values),
     )
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
     source = replayed(values["bag"], values["topic"])
-    return chain(source, calibration=values["calibration"], output=values["output"])
+    return chain(source, calibration=values["calibration"], output=values["output"], monitor=_monitor(values))
 
 
 def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -182,7 +187,7 @@ def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
         seed=int(values["seed"]),
         optics_seed=int(values["optics_seed"]),
     )
-    return chain(source, calibration=values["calibration"], output=values["output"])
+    return chain(source, calibration=values["calibration"], output=values["output"], monitor=_monitor(values))
 
 
 def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -191,11 +196,24 @@ def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
         width_px=size, height_px=size, seed=int(values["seed"]), optics_seed=int(values["optics_seed"])
     )
     controller = NodeSpec("controller", {"law": values["law"]})
-    return chain(source, calibration=values["calibration"], output=values["output"], controller=controller)
+    return chain(
+        source,
+        calibration=values["calibration"],
+        output=values["output"],
+        controller=controller,
+        monitor=_monitor(values),
+    )
+
+
+def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
+    if values["monitor"] not in ("true", "false"):
+        raise InputError("argument monitor", f"'{values['monitor']}'", "true or false")
+    return NodeSpec("monitor") if values["monitor"] == "true" else None
 
 
 _CALIBRATION = {"calibration": ("", "Calibration file; empty: x and y only")}
 _OUTPUT = {"output": ("", "Directory of the bag to record; empty: none")}
+_MONITOR = {"monitor": ("false", "true: show it live to browsers on this machine, see docs/monitor.md")}
 _CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
 _NAMESPACE = {"namespace": ("", "Namespace of the nodes and their topics")}
 _SIMULATION = {
@@ -213,6 +231,7 @@ SYSTEMS = {
             "rate": ("10.0", "Frames per second; 0.0: as the source delivers them"),
             "image_topic": (topics.IMAGE, "Topic of the images"),
             **_OUTPUT,
+            **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
         },
@@ -225,6 +244,7 @@ SYSTEMS = {
             "topic": ("", "Topic of its images; empty: the only one, or the only one named image_raw"),
             **_CALIBRATION,
             **_OUTPUT,
+            **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
         },
@@ -237,6 +257,7 @@ SYSTEMS = {
             "cycles": ("80", "Motion cycles; 80 are a revolution"),
             **_SIMULATION,
             **_OUTPUT,
+            **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
         },
@@ -249,6 +270,7 @@ SYSTEMS = {
             "law": ("", "module:Class of the law that decides the motion; empty: the controller's own"),
             **_SIMULATION,
             **_OUTPUT,
+            **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
         },
@@ -263,8 +285,9 @@ SYSTEMS = {
 class RunningSystem:
     """The processes of a system, by executable."""
 
-    #: Seconds that a process is given after SIGINT and after SIGTERM.
-    GRACE = (12.0, 3.0)
+    #: Seconds that a process is given after SIGINT, enough for a recorder to write what waits for its disk,
+    #: and after SIGTERM.
+    GRACE = (60.0, 3.0)
 
     def __init__(self, processes: Mapping[str, subprocess.Popen[str]]) -> None:
         self.processes = processes

@@ -17,7 +17,9 @@ from mems6dof_ros.recording import messages, topics
 
 
 @contextlib.contextmanager
-def watch_poses(on_pose: Callable[[CyclePose], None], namespace: str = "") -> Iterator[Callable[[float], None]]:
+def watch_poses(
+    on_pose: Callable[[CyclePose], None], namespace: str = ""
+) -> Iterator[Callable[[float], None]]:
     """Call ``on_pose`` with every pose on this machine; yields ``spin(seconds)``, which lets them come."""
     os.environ.update(transport.LOCALHOST_ONLY)
     transport.use_profile(frames=False)

@@ -88,7 +88,7 @@ def approach(
 def safe_stops(settings: SimulationSettings, calibration: Path, log: Path) -> Iterator[tuple[str, int, str]]:
     """What is lost in the middle of a motion, the motion cycles whose frames were exposed after that, and the
     reason that the controller gives."""
-    with closed_loop(settings, calibration, log, pose_timeout=2.0) as (client, system):
+    with closed_loop(settings, calibration, log, pose_timeout=5.0) as (client, system):
         yield (
             "view: lens covered",
             *_interrupted(client, lambda: client.call("frame_source/cover", True), since=_first_dark),

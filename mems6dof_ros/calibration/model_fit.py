@@ -122,7 +122,7 @@ def fit_model(
         if number > 0 and orders is not None:
             current = orders
         elif number in (1, _ROUNDS) and len(beads) != 2:
-            validation = _cross_validate(regression, alignment, interval)
+            validation = _cross_validate(regression, alignment.pieces(), _highest(beads, interval, None))
             current = _best(validation)
         curves = _fit(regression, current)
         residual = _held_out(regression, alignment, current)
@@ -321,13 +321,11 @@ def _residual(sample: BeadSamples, curves: FieldCurves) -> Array:
 
 
 def _cross_validate(
-    regression: FieldRegression, alignment: _Alignment, interval: tuple[float, float]
+    regression: FieldRegression, pieces: list[BeadSamples], highest: tuple[int, int]
 ) -> CrossValidation:
-    pieces = alignment.pieces()
-    beads = alignment._beads
     scores: dict[str, dict[tuple[int, int], float]] = {name: {} for name in GROUPS}
-    field_orders = [order for order in FIELD_ORDERS if order <= _affordable_order(len(beads))]
-    degrees = [degree for degree in DEGREES if degree <= _affordable_degree(beads, interval)]
+    field_orders = [order for order in FIELD_ORDERS if order <= highest[0]]
+    degrees = [degree for degree in DEGREES if degree <= highest[1]]
     folds = _folds(len(pieces))
     for field_order in field_orders:
         for degree in degrees:

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure as Picture
 from numpy.polynomial import Chebyshev
 
 from mems6dof_ros.calibration.calibrate import CalibrationResult
-from mems6dof_ros.calibration.field_curves import Array, BeadSamples, FieldCurves, FieldRegression
+from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.model_fit import GROUPS
 from mems6dof_ros.calibration.optical_model import FEATURES
-from mems6dof_ros.calibration.rho_amp import rho_amp_of_scan
+from mems6dof_ros.calibration.rho_amp import inverse_curves, rho_amp_of_scan
 
 #: The paper's axial range, +/- m.
 _PAPER_RANGE = 4e-6
@@ -99,43 +99,13 @@ def amplitude_curves(result: CalibrationResult) -> Picture:
     return picture
 
 
-def inverse_curves(result: CalibrationResult, degree: int = 16) -> tuple[FieldCurves, Array, Array]:
-    """The paper's literal form: polynomials z(rho_amp) with Zernike coefficients, fitted to all beads.
-
-    Returns the curves over rho_amp in the range that every bead covers around focus, the residuals of all
-    samples (m) and their field positions (n, 2) m. Worse behaved than the inverse of rho_amp(z), since the
-    noise sits in the argument: for comparison with the paper only.
-    """
-    index = FEATURES.index("rho_amp")
-    spans = []
-    for bead in result.curves:
-        values = bead.features[:, index]
-        near = np.abs(bead.stage_z - np.median(bead.stage_z)) < 1.5e-6
-        spans.append((values[near].min(), values[near].max()))
-    low, high = np.quantile([s[0] for s in spans], 0.9), np.quantile([s[1] for s in spans], 0.1)
-    samples = []
-    for bead, sharpest in zip(result.curves, result.fit.sharpest, strict=True):
-        r, u = bead.features[:, index], sharpest - bead.stage_z
-        keep = (r > low) & (r < high) & (np.abs(u) < 2.5e-6)
-        samples.append(
-            BeadSamples(bead.x, bead.y, r[keep], u[keep, None], np.full((np.count_nonzero(keep), 1), 1e14))
-        )
-    order = result.fit.orders.field["rho_amp"]
-    radius = result.calibration.model.curves.radius
-    curves = FieldRegression(samples, radius, (float(low), float(high)), order, degree).fit(order, degree)
-    residuals, places = [], []
-    for sample in samples:
-        local = curves.local(np.array([sample.x]), np.array([sample.y]))[0]
-        residuals.append((sample.values - curves.basis(sample.argument) @ local.T)[:, 0])
-        places.append(np.tile([sample.x, sample.y], (len(sample.argument), 1)))
-    return curves, np.concatenate(residuals), np.concatenate(places)
-
-
 def field_maps(result: CalibrationResult) -> Picture | None:
     """z over the field at a common rho_amp, and the residuals of the paper's Zernike model at the beads."""
     if len(result.curves) < 6:
         return None
-    curves, residual, place = inverse_curves(result)
+    fit = result.fit
+    order, radius = fit.orders.field["rho_amp"], fit.model.curves.radius
+    curves, residual, place = inverse_curves(result.curves, fit.sharpest, radius, order)
     valid = result.calibration.valid
     x, y = np.meshgrid(np.linspace(*valid.x, 60), np.linspace(*valid.y, 60))
     at = np.full(x.size, 0.5 * (curves.interval[0] + curves.interval[1]))

@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from textwrap import shorten
 
 from mems6dof_ros import __version__
+
+_WIDTH = 78
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -32,12 +35,10 @@ def run(args: argparse.Namespace) -> int:
 
     with Progress("validate calibration") as progress:
         table = figures(args.seeds, args.real_data, progress)
-    width = max(len(row["quantity"]) for row in table)
     for row in table:
         verdict = {True: "pass", False: "FAIL", None: ""}[row["passed"]]
-        print(
-            f"{row['quantity']:<{width}}  {row['measured']:>8.4g}  {row['required']:<12}  {verdict}".rstrip()
-        )
+        quantity = shorten(row["quantity"], _WIDTH)
+        print(f"{quantity:<{_WIDTH}}  {row['measured']:>8.4g}  {row['required']:<12}  {verdict}".rstrip())
     failed = sum(row["passed"] is False for row in table)
     print(f"{sum(row['passed'] is True for row in table)} passed, {failed} failed")
     if args.json:

@@ -23,6 +23,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "demo": "mems6dof_ros.cli.demo",
     "monitor": "mems6dof_ros.cli.monitor",
     "cameras": "mems6dof_ros.cli.cameras",
+    "bench": "mems6dof_ros.cli.bench",
     "validate": {
         "localization": "mems6dof_ros.cli.validate_localization",
         "calibration": "mems6dof_ros.cli.validate_calibration",

@@ -21,8 +21,8 @@ from mems6dof_ros.pose.field import FieldModes
 from mems6dof_ros.pose.registration import ConstellationIndex, closest_points, log10_false_alarms
 from mems6dof_ros.pose.rigid import RigidPose, rotation_z
 from mems6dof_ros.pose.settings import PoseSettings, Region
-from mems6dof_ros.pose.solve import FULL, LATERAL, UNUSED, Solution, pose_jacobian, solve_pose
-from mems6dof_ros.pose.usable import Usable, scaled, usable, weights
+from mems6dof_ros.pose.solve import FULL, LATERAL, UNUSED, Solution, pose_jacobian, solve_pose, weights
+from mems6dof_ros.pose.usable import Usable, scaled, usable
 
 __all__ = ["PoseEstimator", "PoseSettings", "Region"]
 

@@ -99,6 +99,15 @@ def pose_jacobian(body: Array, rotation: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def weights(covariance, full):  # type: ignore[no-untyped-def]
+    """Inverse covariances (n, 3, 3); where not ``full`` (n,), of x and y alone."""
+    out = np.zeros_like(covariance)
+    for i in range(len(covariance)):
+        _invert(covariance[i], full[i], out[i])
+    return out
+
+
+@njit(cache=True, nogil=True)
 def _exp(w):  # type: ignore[no-untyped-def]
     angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])

@@ -75,14 +75,6 @@ def scaled(covariance: Array, factor: Array) -> Array:
     return np.asarray(covariance * root[:, :, None] * root[:, None, :])
 
 
-def weights(covariance: Array, full: Mask) -> Array:
-    """Inverse covariances (n, 3, 3); where not ``full`` (n,), of x and y alone."""
-    out = np.zeros_like(covariance)
-    out[full] = np.linalg.inv(covariance[full])
-    out[~full, :2, :2] = np.linalg.inv(covariance[~full, :2, :2])
-    return out
-
-
 def _check_shapes(localizations: Localizations) -> None:
     n = len(localizations.position)
     for name, shape in (("position", (n, 3)), ("covariance", (n, 3, 3)), ("flags", (n,))):

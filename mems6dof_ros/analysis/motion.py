@@ -28,8 +28,10 @@ class CircularMotion:
 
     ``mean`` (2,): fixed in the field; ``turning`` (2,): fixed to the body, at psi = 0 (eccentricity, or
     tilt of the body on its axis); ``drift`` (2,) per cycle; ``sd_turning``, ``sd_drift``: of each component;
-    ``play`` (n, 2): what remains; ``turns``: revolutions covered. Below half a revolution
-    ``mean`` and ``turning`` are hardly told apart: ``sd_turning`` says so.
+    ``play`` (n, 2): what remains, with the part that turns and the drift left in it where they are not
+    significant (``turning_found``, ``drift_found``), since removing what is not there adds to its range;
+    ``turns``: revolutions covered. Below half a revolution ``mean`` and ``turning`` are hardly told apart:
+    ``sd_turning`` says so.
     """
 
     mean: Array
@@ -37,6 +39,8 @@ class CircularMotion:
     drift: Array
     sd_turning: float
     sd_drift: float
+    turning_found: bool
+    drift_found: bool
     play: Array
     turns: float
 
@@ -57,10 +61,10 @@ class CircularMotion:
 
 
 def separate_turning(
-    values: Array, psi: Array, cycle: NDArray[np.int64] | None = None, with_drift: bool = True
+    values: Array, psi: Array, cycle: NDArray[np.int64] | None = None, significance: float = 3.0
 ) -> CircularMotion:
     """Least squares of ``values`` (n, 2) = mean + Rz(psi) turning + drift k + play; ``psi`` (n,); ``cycle``
-    (n,), None: none is missing.
+    (n,), None: none is missing; ``significance``: standard deviations from which a part is one.
 
     Drift is left out below one revolution, where it cannot be told from the turning part. The standard
     deviations are those of play that remembers the cycle before. Raises InputError for fewer than 8 cycles.
@@ -69,21 +73,34 @@ def separate_turning(
     if n < 8:
         raise InputError("motion analysis", f"{n} cycles", "8 or more")
     turns = float(np.ptp(psi) / math.tau)
-    with_drift = with_drift and turns >= 1
-    c, s, one, zero = np.cos(psi), np.sin(psi), np.ones(n), np.zeros(n)
-    k = _counted(cycle, n)
-    x_rows = [one, zero, c, -s] + ([k, zero] if with_drift else [])
-    y_rows = [zero, one, s, c] + ([zero, k] if with_drift else [])
-    design = np.concatenate([np.column_stack(x_rows), np.column_stack(y_rows)])
+    c, s, one, zero, k = np.cos(psi), np.sin(psi), np.ones(n), np.zeros(n), _counted(cycle, n)
+    x_rows = [one, zero, c, -s, k, zero]
+    y_rows = [zero, one, s, c, zero, k]
+    parts = 6 if turns >= 1 else 4
+    design = np.concatenate([np.column_stack(x_rows), np.column_stack(y_rows)])[:, :parts]
     target = values.T.ravel()
     solution, _, rank, _ = np.linalg.lstsq(design, target, rcond=1e-9)
     left = target - design @ solution
-    variance = float(left @ left) / max(2 * n - rank, 1)
-    play = left.reshape(2, n).T
-    spread = variance * memory_factor(play) * np.diag(np.linalg.pinv(design.T @ design, rcond=1e-12))
-    sd = math.sqrt(spread[2]) if rank == design.shape[1] else math.inf
-    drift, sd_drift = (solution[4:6], math.sqrt(spread[4])) if with_drift else (np.zeros(2), math.inf)
-    return CircularMotion(solution[:2], solution[2:4], drift, sd, sd_drift, play, turns)
+    variance = float(left @ left) / max(2 * n - rank, 1) * memory_factor(left.reshape(2, n).T)
+    sd = np.full(6, math.inf)
+    if rank == parts:
+        sd[:parts] = np.sqrt(variance * np.diag(np.linalg.inv(design.T @ design)))
+    turning_found = bool(np.hypot(*solution[2:4]) > significance * sd[2])
+    drift_found = parts == 6 and bool(np.hypot(*solution[4:6]) > significance * sd[4])
+    removed = np.array([True, True, turning_found, turning_found, drift_found, drift_found])[:parts]
+    play = (target - design @ (solution * removed)).reshape(2, n).T
+    drift = solution[4:6] if parts == 6 else np.zeros(2)
+    return CircularMotion(
+        solution[:2],
+        solution[2:4],
+        drift,
+        float(sd[2]),
+        float(sd[4]),
+        turning_found,
+        drift_found,
+        play,
+        turns,
+    )
 
 
 def memory_factor(play: Array) -> float:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import GroundTruth
 from mems6dof_ros.localization.localizations import Localizations
-from mems6dof_ros.pose.angles import paper_angles, swing_twist, unwrap_near
+from mems6dof_ros.pose.angles import paper_angles, swing_twist, swing_twist_jacobian, unwrap_near
 from mems6dof_ros.pose.cycle_pose import CyclePose
-from mems6dof_ros.pose.rigid import RigidPose, kabsch
+from mems6dof_ros.pose.rigid import RigidPose, kabsch, shift_origin
 from mems6dof_ros.recording import messages
 from mems6dof_ros.recording.bag import BagReader
 
@@ -122,13 +122,19 @@ def _expressed(pose: CyclePose, moved: RigidPose, version: int, origin: NDArray[
     tilt_x, tilt_y, psi = swing_twist(moved.rotation)
     angles = tilt_x, tilt_y, unwrap_near(psi, pose.displacement[5])
     displacement = np.array([*(moved.translation - origin), *angles])
+    covariance = shift_origin(pose.covariance, moved.translation - pose.translation)
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] = swing_twist_jacobian(tilt_x, tilt_y)
+    of_displacement = jacobian @ covariance @ jacobian.T
     return replace(
         pose,
         reference_version=version,
         rotation=moved.rotation,
         translation=moved.translation,
+        covariance=covariance,
         displacement=displacement,
-        angles=paper_angles(displacement, pose.displacement_covariance),
+        displacement_covariance=of_displacement,
+        angles=paper_angles(displacement, of_displacement),
     )
 
 

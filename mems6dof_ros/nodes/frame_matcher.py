@@ -22,7 +22,7 @@ class FrameMatcher:
     callbacks' own timer, so that time in which no callback could run does not count.
     """
 
-    def __init__(self, patience: int = 2, capacity: int = 256) -> None:
+    def __init__(self, patience: int = 10, capacity: int = 256) -> None:
         self._patience, self._capacity = patience, capacity
         self._infos: OrderedDict[int, Any] = OrderedDict()
         self._last_info_ns = -1

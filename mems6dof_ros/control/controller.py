@@ -117,6 +117,8 @@ class Controller:
         awaited = self._awaited
         if awaited is None or answer.id != awaited.id or awaited.cycle:
             return None
+        if answer.received_ns * 1e-9 < awaited.sent:
+            return None  # to a controller before this one, which counted from 1 too
         self.cycles += answer.cycles_driven
         if answer.outcome is not Outcome.DONE:
             return self.stop(f"the drive {answer.outcome.name.lower()} command {answer.id}: {answer.reason}")

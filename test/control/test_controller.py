@@ -44,7 +44,8 @@ def pose(cycle, psi=0.0, at=NOW, **changes):
 
 
 def done(number, cycle, **changes):
-    return replace(Acknowledgement(number, Outcome.DONE, "", 1, cycle, 0), **changes)
+    received_ns = changes.pop("received_ns", round((NOW + 1e5) * 1e9))  # after whatever was sent
+    return replace(Acknowledgement(number, Outcome.DONE, "", 1, cycle, received_ns), **changes)
 
 
 @pytest.fixture
@@ -78,6 +79,13 @@ def test_at_rest_it_says_nothing_whatever_comes(controller):
     assert controller.on_acknowledgement(done(9, 1), NOW) is None
     assert controller.on_time(NOW + 1e9) is None
     assert controller.state is State.IDLE
+
+
+def test_an_answer_to_the_controller_before_this_one_is_not_taken(controller):
+    controller.set_target(1.0, NOW)
+    controller.on_pose(pose(4), NOW)
+    assert controller.on_acknowledgement(done(1, 4, received_ns=round((NOW - 1) * 1e9)), NOW) is None
+    assert controller.on_acknowledgement(done(1, 4), NOW).command.id == 2
 
 
 def arrive(controller, cycle=4, psi=2.0):

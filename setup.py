@@ -35,6 +35,7 @@ setup(
             "frame_source = mems6dof_ros.nodes.frame_source:main",
             "localizer = mems6dof_ros.nodes.localizer:main",
             "pose_estimator = mems6dof_ros.nodes.pose_estimator:main",
+            "pipeline = mems6dof_ros.nodes.pipeline:main",
             "recorder = mems6dof_ros.nodes.recorder:main",
             "controller = mems6dof_ros.nodes.controller:main",
             "monitor = mems6dof_ros.nodes.monitor:main",

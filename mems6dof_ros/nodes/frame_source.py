@@ -17,7 +17,7 @@ import enum
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -134,8 +134,8 @@ class State(enum.Enum):
 class FrameSourceNode(InstrumentNode):
     """Reads frames from a FrameSource and publishes them at the pace that is asked for."""
 
-    def __init__(self) -> None:
-        super().__init__("frame_source", PARAMETERS)
+    def __init__(self, name: str = "frame_source", parameters: Sequence[Parameter] = PARAMETERS) -> None:
+        super().__init__(name, parameters)
         self._source = open_source(self.values["source"], **self._options())
         self._changed = threading.Condition()
         self._state = State.WAITING
@@ -165,6 +165,10 @@ class FrameSourceNode(InstrumentNode):
             f" {'no end' if info.frames is None else f'{info.frames} frames'}"
         )
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
+        self._begin_when_ready()
+
+    def _begin_when_ready(self) -> None:
+        """Begin when everybody listens."""
         self.when_ready(self.missing_subscribers(self._topics), self._thread.start)
 
     def end(self, spin: Callable[[float], None]) -> None:
@@ -223,25 +227,32 @@ class FrameSourceNode(InstrumentNode):
             due = self._wait_for_turn(due)
             if self._abandon:
                 return
-            self._publish(frame)
+            self._deliver(frame)
             with self._changed:
                 self._steps = max(self._steps - 1, 0)
         self._wait_for_consumer(0)
         self._set_state(State.ENDED)
 
-    def _publish(self, frame: Frame) -> None:
-        stamp = frame.stamp_ns
-        image = messages.to_rclpy(messages.image(frame))
+    def _deliver(self, frame: Frame) -> None:
+        """What is done with a frame whose turn has come."""
         with self._changed:
-            self._in_flight[stamp] = time.monotonic()
+            self._in_flight[frame.stamp_ns] = time.monotonic()
         start = time.monotonic()
-        frame = replace(frame, published_ns=time.time_ns())
+        self._publish(frame)
+        self.health.time("publishing", time.monotonic() - start)
+
+    def _publish(self, frame: Frame, published_ns: int | None = None) -> None:
+        """Publish; ``published_ns``: when it was made known already, host clock."""
+        # The message is made before the clock of the latency runs, and only for somebody.
+        images = self._topics[topics.IMAGE]
+        image = messages.to_rclpy(messages.image(frame)) if images.get_subscription_count() else None
+        frame = replace(frame, published_ns=published_ns or time.time_ns())
         self._topics[topics.FRAME_INFO].publish(messages.to_rclpy(messages.frame_info(frame)))
         for truth in messages.ground_truths(frame):
             self._topics[topics.TRUTH].publish(messages.to_rclpy(truth))
         self._topics[topics.CAMERA_INFO].publish(messages.to_rclpy(messages.camera_info(frame)))
-        self._topics[topics.IMAGE].publish(image)
-        self.health.time("publishing", time.monotonic() - start)
+        if image is not None:
+            images.publish(image)
         self.health.count("frames")
         if frame.frames_dropped:
             self.health.lost(frame.frames_dropped, f"the source lost {frame.frames_dropped} frames")

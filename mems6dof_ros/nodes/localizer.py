@@ -2,7 +2,8 @@
 
 Subscribes to ``image_raw`` and, where somebody publishes it, ``frame_info``; publishes ``localizations``,
 and ``localizations/points`` (sensor_msgs/PointCloud2) while somebody listens. Every frame gives one
-message: an empty one where the frame cannot be used, so that nobody waits for it in vain.
+message: an empty one where the frame cannot be used, so that nobody waits for it in vain. With
+``tracking.enabled`` it subscribes to ``pose_6dof`` too.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import math
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -19,7 +21,7 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
-from mems6dof_msgs.msg import FrameInfo
+from mems6dof_msgs.msg import FrameInfo, Pose6DOF
 from mems6dof_msgs.msg import Localizations as LocalizationsMessage
 from mems6dof_ros.calibration.estimator import METHODS
 from mems6dof_ros.calibration.file import load_calibration
@@ -30,10 +32,12 @@ from mems6dof_ros.localization.detection import DetectionSettings
 from mems6dof_ros.localization.fitting import WEIGHTINGS
 from mems6dof_ros.localization.localizations import FIT_PARAMETERS, GaussianFits, Latency, Localizations
 from mems6dof_ros.localization.localizer import Localizer, LocalizerSettings
+from mems6dof_ros.localization.tracking import TrackingLocalizer, TrackingSettings
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
 
 POINTS = "localizations/points"
@@ -54,6 +58,10 @@ _SETTINGS = {
     "least_significance": ("1", "Least amplitude in its standard deviations, else flagged as a poor fit."),
     "most_sigma": ("1", "Greatest width as a fraction of the window, else flagged as a poor fit."),
     "most_misfit": ("1", "Greatest rms residual beyond noise as a fraction of the light, else a poor fit."),
+}
+_TRACKING = {
+    "detection_period": ("frames", "The whole frame is searched every so many frames."),
+    "least_found": ("1", "Fraction of the expected good fits below which a frame is searched at once."),
 }
 _CAMERA = {
     "offset_adu": ("ADU", "Pixel value without light"),
@@ -78,7 +86,56 @@ PARAMETERS = (
     ),
     *of_settings(LocalizerSettings, "", _SETTINGS),
     *of_settings(DetectionSettings, "detection.", _DETECTION),
+    Parameter(
+        "tracking.enabled",
+        False,
+        "Fit where the poses of one body say that its particles will be, and search the whole frame only now"
+        " and then, or when they are not found there.",
+    ),
+    Parameter("tracking.body", "load_gear", "Name of that body."),
+    *of_settings(TrackingSettings, "tracking.", _TRACKING),
 )
+
+
+class LocalizationOutput:
+    """Localizes frames and publishes what it found, on behalf of a node with the parameters above."""
+
+    def __init__(self, node: InstrumentNode) -> None:
+        self._node = node
+        self.localizer = make_localizer(node.values)
+        self.tracker: TrackingLocalizer | None = None
+        if node.values["tracking.enabled"]:
+            settings = to_settings(TrackingSettings, "tracking.", node.values)
+            self.tracker = TrackingLocalizer(self.localizer, settings)
+        self.publisher = node.create_publisher(LocalizationsMessage, topics.LOCALIZATIONS, transport.MESSAGES)
+        self._points = node.create_publisher(PointCloud2, POINTS, transport.FRAMES)
+        calibration = self.localizer.calibration
+        node.get_logger().info(
+            f"calibration {calibration.calibration_id}, method {calibration.method}"
+            if calibration
+            else "no calibration: x and y only"
+        )
+
+    def localize(self, frame: Frame) -> Localizations:
+        """As Localizer.localize."""
+        return (self.tracker or self.localizer).localize(frame)
+
+    def observe(self, pose: CyclePose) -> None:
+        """Let the pose of a cycle tell where particles will be; from the thread that localizes."""
+        if self.tracker and pose.valid and pose.body == self._node.values["tracking.body"]:
+            self.tracker.observe(pose.cycle, pose.rotation, pose.translation, pose.reference_version)
+
+    def publish(self, found: Localizations) -> None:
+        """Publish, and keep account of it."""
+        self.publisher.publish(messages.to_rclpy(messages.localizations(found)))
+        if self._points.get_subscription_count():
+            self._points.publish(point_cloud(found))
+        health = self._node.health
+        health.count("frames localized")
+        health.set("particles", len(found))
+        health.time("localization", found.latency.localization)
+        if self.tracker:
+            health.set("frames searched", self.tracker.detections)
 
 
 class LocalizerNode(InstrumentNode):
@@ -86,23 +143,16 @@ class LocalizerNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("localizer", PARAMETERS)
-        self._localizer = make_localizer(self.values)
+        self._output = LocalizationOutput(self)
         self._matcher = FrameMatcher()
         self._last = -1, -1  # frame counter and cycle of the frame before
         self._dropped = 0
-        self._localizations = self.create_publisher(
-            LocalizationsMessage, topics.LOCALIZATIONS, transport.MESSAGES
-        )
-        self._points = self.create_publisher(PointCloud2, POINTS, transport.FRAMES)
+        self._poses: deque[CyclePose] = deque(maxlen=16)
         self.start_worker(self._localize)
-        calibration = self._localizer.calibration
-        self.get_logger().info(
-            f"calibration {calibration.calibration_id}, method {calibration.method}"
-            if calibration
-            else "no calibration: x and y only"
-        )
-        missing = self.missing_subscribers({topics.LOCALIZATIONS: self._localizations})
-        self.when_ready(missing, self._subscribe, lambda: rehearse(self._localizer))
+        if self._output.tracker:
+            self.create_subscription(Pose6DOF, topics.POSE_6DOF, self._on_pose, transport.MESSAGES)
+        missing = self.missing_subscribers({topics.LOCALIZATIONS: self._output.publisher})
+        self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.localizer))
 
     def _subscribe(self) -> None:
         self.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES)
@@ -120,6 +170,9 @@ class LocalizerNode(InstrumentNode):
     def _on_image(self, image: Image) -> None:
         self._matcher.add_image(messages.nanoseconds(image.header.stamp), image, time.time_ns())
         self._forward()
+
+    def _on_pose(self, pose: Pose6DOF) -> None:
+        self._poses.append(messages.to_cycle_pose(pose))
 
     def _on_tick(self) -> None:
         self._matcher.tick()
@@ -140,11 +193,17 @@ class LocalizerNode(InstrumentNode):
         begin_ns = time.time_ns()
         counter, cycle, lost = self._account(arrived.info)
         try:
+            while self._poses:
+                self._output.observe(self._poses.popleft())
             frame = messages.to_frame(arrived.image, arrived.info)
-            found = self._localizer.localize(replace(frame, frame_counter=counter, cycle=cycle))
+            found = self._output.localize(replace(frame, frame_counter=counter, cycle=cycle))
         except InputError as error:
             self.health.refused(str(error))
-            found = _nothing(arrived, counter, cycle)
+            header = arrived.image.header
+            published_ns = messages.nanoseconds(arrived.info.publication_time) if arrived.info else 0
+            found = nothing_found(
+                messages.nanoseconds(header.stamp), header.frame_id, counter, cycle, published_ns
+            )
         published_ns = time.time_ns()
         found = replace(
             found,
@@ -152,12 +211,7 @@ class LocalizerNode(InstrumentNode):
             latency=_latency(arrived, begin_ns, published_ns),
             published_ns=published_ns,
         )
-        self._localizations.publish(messages.to_rclpy(messages.localizations(found)))
-        if self._points.get_subscription_count():
-            self._points.publish(point_cloud(found))
-        self.health.count("frames")
-        self.health.set("particles", len(found))
-        self.health.time("localization", found.latency.localization)
+        self._output.publish(found)
         self.health.time("waiting in the queue", found.latency.queue)
 
     def _account(self, info: FrameInfo | None) -> tuple[int, int, int]:
@@ -244,9 +298,10 @@ def _latency(arrived: ArrivedFrame, begin_ns: int, published_ns: int) -> Latency
     )
 
 
-def _nothing(arrived: ArrivedFrame, counter: int, cycle: int) -> Localizations:
+def nothing_found(
+    stamp_ns: int, frame_id: str, frame_counter: int, cycle: int, frame_published_ns: int
+) -> Localizations:
     """No particles, for a frame that cannot be used."""
-    header = arrived.image.header
     fits = GaussianFits(
         parameters=np.empty((0, len(FIT_PARAMETERS))),
         covariance=np.empty((0, len(FIT_PARAMETERS), len(FIT_PARAMETERS))),
@@ -255,16 +310,16 @@ def _nothing(arrived: ArrivedFrame, counter: int, cycle: int) -> Localizations:
         flags=np.empty(0, np.uint32),
     )
     return Localizations(
-        stamp_ns=messages.nanoseconds(header.stamp),
-        frame_id=header.frame_id,
-        frame_counter=counter,
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
+        frame_counter=frame_counter,
         cycle=cycle,
         position=np.empty((0, 3)),
         covariance=np.empty((0, 3, 3)),
         fits=fits,
         z_gap=np.empty(0),
         flags=np.empty(0, np.uint32),
-        frame_published_ns=messages.nanoseconds(arrived.info.publication_time) if arrived.info else 0,
+        frame_published_ns=frame_published_ns,
     )
 
 

@@ -39,6 +39,7 @@ NODES = (
     "frame_source",
     "localizer",
     "pose_estimator",
+    "pipeline",
     "recorder",
     "controller",
     "monitor",

@@ -65,57 +65,31 @@ PARAMETERS = (
 )
 
 
-class PoseEstimatorNode(InstrumentNode):
-    """PoseEstimator behind a queue."""
+class PoseOutput:
+    """Estimates poses, publishes them and serves requests, on behalf of a node with the parameters above."""
 
-    def __init__(self) -> None:
-        super().__init__("pose_estimator", PARAMETERS)
-        settings = to_settings(PoseSettings, "", self.values)
-        self._estimator = PoseEstimator(settings, self.values["body"])
+    def __init__(self, node: InstrumentNode) -> None:
+        self._node = node
+        self.settings = to_settings(PoseSettings, "", node.values)
+        self._estimator = PoseEstimator(self.settings, node.values["body"])
         self._using_estimator = threading.Lock()
         self._last_counter: int | None = None
-        self._pose_6dof = self.create_publisher(Pose6DOF, topics.POSE_6DOF, transport.MESSAGES)
-        self._pose = self.create_publisher(PoseStamped, topics.POSE, transport.MESSAGES)
-        self._pose_with_covariance = self.create_publisher(
-            PoseWithCovarianceStamped, topics.POSE_WITH_COVARIANCE, transport.MESSAGES
-        )
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/set_reference", self._on_set_reference)
-        self.start_worker(self._estimate)
-        publishers = {
-            topics.POSE_6DOF: self._pose_6dof,
-            topics.POSE: self._pose,
-            topics.POSE_WITH_COVARIANCE: self._pose_with_covariance,
+        self.publishers = {
+            topic: node.create_publisher(kind, topic, transport.MESSAGES)
+            for topic, kind in (
+                (topics.POSE_6DOF, Pose6DOF),
+                (topics.POSE, PoseStamped),
+                (topics.POSE_WITH_COVARIANCE, PoseWithCovarianceStamped),
+            )
         }
-        self.when_ready(self.missing_subscribers(publishers), self._subscribe, lambda: rehearse(settings))
+        node.create_service(Trigger, "~/reset", self._on_reset)
+        node.create_service(Trigger, "~/set_reference", self._on_set_reference)
 
-    def _subscribe(self) -> None:
-        assert self.worker is not None
-        self.create_subscription(
-            LocalizationsMessage,
-            topics.LOCALIZATIONS,
-            self._on_localizations,
-            transport.MESSAGES,
-            callback_group=WhileRoom(self.worker),
-        )
-        self.tell("ready")
-
-    def _on_localizations(self, message: LocalizationsMessage) -> None:
-        assert self.worker is not None
-        self.worker.put((message, time.time_ns()))
-
-    # The worker ---------------------------------------------------------------------------------
-
-    def _estimate(self, arrived: tuple[LocalizationsMessage, int]) -> None:
-        message, arrival_ns = arrived
-        try:
-            found = messages.to_localizations(message)
-            self._account(found)
-            with self._using_estimator:
-                cycle_pose = self._estimator.update(found)
-        except InputError as error:
-            self.health.refused(str(error))
-            return
+    def estimate(self, found: Localizations, arrival_ns: int) -> CyclePose:
+        """The pose, published; raises as PoseEstimator.update. ``arrival_ns`` of ``found``, host clock."""
+        self._account(found)
+        with self._using_estimator:
+            cycle_pose = self._estimator.update(found)
         published_ns = time.time_ns()
         latency = replace(
             found.latency,
@@ -123,31 +97,34 @@ class PoseEstimatorNode(InstrumentNode):
             pose=(published_ns - arrival_ns) * 1e-9,
             total=(published_ns - found.frame_published_ns) * 1e-9 if found.frame_published_ns else NAN,
         )
-        self._publish(replace(cycle_pose, latency=latency))
+        cycle_pose = replace(cycle_pose, latency=latency)
+        self._publish(cycle_pose)
+        return cycle_pose
 
     def _publish(self, cycle_pose: CyclePose) -> None:
-        self._pose_6dof.publish(messages.to_rclpy(messages.pose6dof(cycle_pose)))
+        self.publishers[topics.POSE_6DOF].publish(messages.to_rclpy(messages.pose6dof(cycle_pose)))
         if cycle_pose.valid:
-            self._pose.publish(messages.to_rclpy(messages.pose_stamped(cycle_pose)))
-            self._pose_with_covariance.publish(
-                messages.to_rclpy(messages.pose_with_covariance_stamped(cycle_pose))
-            )
-        self.health.state = cycle_pose.status.name.lower() + (
+            pose = messages.pose_stamped(cycle_pose)
+            covariant = messages.pose_with_covariance_stamped(cycle_pose)
+            self.publishers[topics.POSE].publish(messages.to_rclpy(pose))
+            self.publishers[topics.POSE_WITH_COVARIANCE].publish(messages.to_rclpy(covariant))
+        health = self._node.health
+        health.state = cycle_pose.status.name.lower() + (
             f": {cycle_pose.reason}" if cycle_pose.reason else ""
         )
-        self.health.count("poses")
-        self.health.count(f"poses {cycle_pose.status.name.lower()}")
-        self.health.set("particles used", cycle_pose.particles_used)
-        self.health.set("residual xy, nm", f"{cycle_pose.residual_rms_xy * 1e9:.2f}")
-        self.health.set("residual z, nm", f"{cycle_pose.residual_rms_z * 1e9:.1f}")
-        self.health.time("pose", cycle_pose.latency.pose)
-        self.health.time("frame to pose", cycle_pose.latency.total)
+        health.count("poses")
+        health.count(f"poses {cycle_pose.status.name.lower()}")
+        health.set("particles used", cycle_pose.particles_used)
+        health.set("residual xy, nm", f"{cycle_pose.residual_rms_xy * 1e9:.2f}")
+        health.set("residual z, nm", f"{cycle_pose.residual_rms_z * 1e9:.1f}")
+        health.time("pose", cycle_pose.latency.pose)
+        health.time("frame to pose", cycle_pose.latency.total)
 
     def _account(self, found: Localizations) -> None:
         """Count the localizations that were lost on the way here."""
         last, self._last_counter = self._last_counter, found.frame_counter
         if last is not None and (lost := found.frame_counter - last - 1 - found.frames_dropped) > 0:
-            self.health.lost(lost, f"{lost} localizations lost before frame {found.frame_counter}")
+            self._node.health.lost(lost, f"{lost} localizations lost before frame {found.frame_counter}")
 
     # Services -----------------------------------------------------------------------------------
 
@@ -165,6 +142,39 @@ class PoseEstimatorNode(InstrumentNode):
         except InputError as error:
             response.success, response.message = False, str(error)
         return response
+
+
+class PoseEstimatorNode(InstrumentNode):
+    """PoseEstimator behind a queue."""
+
+    def __init__(self) -> None:
+        super().__init__("pose_estimator", PARAMETERS)
+        self._output = PoseOutput(self)
+        self.start_worker(self._estimate)
+        missing = self.missing_subscribers(self._output.publishers)
+        self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.settings))
+
+    def _subscribe(self) -> None:
+        assert self.worker is not None
+        self.create_subscription(
+            LocalizationsMessage,
+            topics.LOCALIZATIONS,
+            self._on_localizations,
+            transport.MESSAGES,
+            callback_group=WhileRoom(self.worker),
+        )
+        self.tell("ready")
+
+    def _on_localizations(self, message: LocalizationsMessage) -> None:
+        assert self.worker is not None
+        self.worker.put((message, time.time_ns()))
+
+    def _estimate(self, arrived: tuple[LocalizationsMessage, int]) -> None:
+        message, arrival_ns = arrived
+        try:
+            self._output.estimate(messages.to_localizations(message), arrival_ns)
+        except InputError as error:
+            self.health.refused(str(error))
 
 
 def rehearse(settings: PoseSettings) -> None:

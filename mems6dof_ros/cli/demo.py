@@ -158,6 +158,7 @@ def _measure(
         output=str(bag),
         recorded=[*DEFAULT_TOPICS, topics.IMAGE],
         compression="zstd",
+        watched={topics.POSE_6DOF: "watch"},
         monitor=NodeSpec("monitor", {"port": 0}),
     )
     with log.open("w", encoding="utf-8") as lines, Progress("     cycles") as progress:

@@ -43,8 +43,8 @@ QUEUE_PARAMETERS = (
 WAIT_PARAMETER = Parameter(
     "wait_for_subscribers",
     (),
-    "Publish nothing before each of these topics has so many subscribers, so that nobody misses the"
-    " beginning: a list of topic:number.",
+    "Publish nothing before these nodes subscribe to these topics, so that none misses the beginning: a"
+    " list of topic:node; or topic:number, so many of whatever name.",
 )
 
 
@@ -133,12 +133,15 @@ class InstrumentNode(Node):
         required = required_subscribers(self.values[WAIT_PARAMETER.name], publishers)
 
         def missing() -> str:
-            counts = {topic: publishers[topic].get_subscription_count() for topic in required}
-            lacking = [
-                f"{topic} ({counts[topic]} of {number})"
-                for topic, number in required.items()
-                if counts[topic] < number
-            ]
+            lacking = []
+            for topic, (names, number) in required.items():
+                name = publishers[topic].topic_name
+                here = {info.node_name for info in self.get_subscriptions_info_by_topic(name)}
+                matched = publishers[topic].get_subscription_count()
+                if absent := sorted(names - here):
+                    lacking.append(f"{topic} ({', '.join(absent)})")
+                elif matched < (least := max(number, len(names))):
+                    lacking.append(f"{topic} ({matched} of {least})")
             return f"subscribers of {', '.join(lacking)}" if lacking else ""
 
         return missing
@@ -163,18 +166,20 @@ class InstrumentNode(Node):
             publisher.wait_for_all_acked(Duration(seconds=max(deadline - time.monotonic(), 0.0)))
 
 
-def required_subscribers(entries: Sequence[str], topics: Collection[str]) -> dict[str, int]:
-    """``["pose_6dof:2"]`` to ``{"pose_6dof": 2}``; InputError where an entry is malformed."""
-    required = {}
+def required_subscribers(entries: Sequence[str], topics: Collection[str]) -> dict[str, tuple[set[str], int]]:
+    """``["pose_6dof:recorder", "pose:2"]`` to ``{"pose_6dof": ({"recorder"}, 0), "pose": (set(), 2)}``;
+    InputError where an entry is malformed."""
+    required: dict[str, tuple[set[str], int]] = {}
     for entry in entries:
-        topic, _, number = entry.partition(":")
-        if topic not in topics or not number.isdigit():
+        topic, _, who = entry.partition(":")
+        if topic not in topics or not who:
             raise InputError(
                 f"parameter {WAIT_PARAMETER.name}",
                 f"'{entry}'",
-                f"topic:number, topic one of {', '.join(topics)}",
+                f"topic:node or topic:number, topic one of {', '.join(topics)}",
             )
-        required[topic] = int(number)
+        names, number = required.get(topic, (set(), 0))
+        required[topic] = (names, int(who)) if who.isdigit() else ({*names, who}, number)
     return required
 
 

@@ -33,7 +33,7 @@ from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.messages import nanoseconds
 
 #: What a client listens to: for ``system.chain(watched=...)``.
-WATCHED = (topics.POSE_6DOF, topics.TRUTH)
+WATCHED = {topics.POSE_6DOF: "loop_client", topics.TRUTH: "loop_client"}
 
 _RESTING = (ControllerState.STATE_ARRIVED, ControllerState.STATE_STOPPED)
 

@@ -34,6 +34,7 @@ _PUBLISHED = {
     "localizer": (topics.LOCALIZATIONS,),
     "pose_estimator": (topics.POSE_6DOF, topics.POSE, topics.POSE_WITH_COVARIANCE),
 }
+_PUBLISHED["pipeline"] = tuple(topic for published in _PUBLISHED.values() for topic in published)
 _SUBSCRIBED = {
     "localizer": (topics.IMAGE, topics.FRAME_INFO),
     "pose_estimator": (topics.LOCALIZATIONS,),
@@ -84,21 +85,27 @@ def chain(
     recorded: Sequence[str] = DEFAULT_TOPICS,
     compression: str = "none",
     controller: NodeSpec | None = None,
-    watched: Sequence[str] = (),
+    watched: Mapping[str, str] | None = None,
     monitor: NodeSpec | None = None,
+    arrangement: str = "processes",
 ) -> list[NodeSpec]:
     """frame_source, localizer, pose_estimator, ``controller`` if any, with an ``output`` recorder, and
-    ``monitor`` if any.
+    ``monitor`` if any. ``arrangement`` pipeline: the first three in one process.
 
-    ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for
-    the subscribers that the table gives it, and for one more of each topic in ``watched``, so that nothing is
-    lost at the beginning.
+    ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for the
+    subscribers that the table gives it, and for those in ``watched`` (topic to the name of a node that is not in
+    the table), so that nothing is lost at the beginning. Nobody waits for a monitor.
     """
     queue = {"queue_policy": queue_policy}
     remap = {topics.IMAGE: image_topic} if image_topic != topics.IMAGE else {}
-    nodes = [source] if source else []
-    nodes.append(NodeSpec("localizer", {"calibration": calibration, **queue}, remap))
-    nodes.append(NodeSpec("pose_estimator", queue))
+    if arrangement == "pipeline":
+        nodes = [_in_one_process(source, calibration)]
+    elif arrangement == "processes":
+        nodes = [source] if source else []
+        nodes.append(NodeSpec("localizer", {"calibration": calibration, **queue}, remap))
+        nodes.append(NodeSpec("pose_estimator", queue))
+    else:
+        raise InputError("argument arrangement", f"'{arrangement}'", "processes or pipeline")
     if controller:
         nodes.append(controller)
     if output:
@@ -112,7 +119,8 @@ def chain(
         nodes.append(NodeSpec("recorder", recorder, remap))
     if monitor:
         nodes.append(replace(monitor, remappings=remap))
-    subscribed = [*watched, *(topic for node in nodes for topic in _subscriptions(node))]
+    subscribed = [(topic, node.executable) for node in nodes for topic in _subscriptions(node)]
+    subscribed += (watched or {}).items()
     return [_waiting_for_subscribers(node, subscribed) for node in nodes]
 
 
@@ -141,21 +149,28 @@ def _finite(kind: str, options: Mapping[str, Any]) -> NodeSpec:
     return NodeSpec("frame_source", {"source": kind, **pacing, **options}, ends_system=True)
 
 
-def _waiting_for_subscribers(node: NodeSpec, subscribed: Sequence[str]) -> NodeSpec:
-    waits = [
-        f"{topic}:{subscribed.count(topic)}"
-        for topic in _PUBLISHED.get(node.executable, ())
-        if topic in subscribed
-    ]
+def _in_one_process(source: NodeSpec | None, calibration: str) -> NodeSpec:
+    if source is None:
+        found = "pipeline without a source of ours"
+        raise InputError("argument arrangement", found, "processes, where somebody else publishes the images")
+    parameters = {name: value for name, value in source.parameters.items() if name != "acknowledged_by"}
+    if parameters["pacing"] == "consumer":
+        parameters |= {"pacing": "rate", "rate": 0.0}  # what is called is waited for
+    return replace(source, executable="pipeline", parameters={**parameters, "calibration": calibration})
+
+
+def _waiting_for_subscribers(node: NodeSpec, subscribed: Sequence[tuple[str, str]]) -> NodeSpec:
+    published = _PUBLISHED.get(node.executable, ())
+    waits = [f"{topic}:{name}" for topic, name in subscribed if topic in published]
     return replace(node, parameters={**node.parameters, WAIT_PARAMETER.name: waits}) if waits else node
 
 
 def _subscriptions(node: NodeSpec) -> Sequence[str]:
     if node.executable == "recorder":
         return list(node.parameters["topics"])
-    if node.executable == "frame_source":
+    if node.executable in ("frame_source", "pipeline"):
         return [node.parameters["acknowledged_by"]] if node.parameters["pacing"] == "consumer" else []
-    return _SUBSCRIBED.get(node.executable, ())  # nobody waits for a monitor
+    return _SUBSCRIBED.get(node.executable, ())
 
 
 def _live(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -170,12 +185,19 @@ def _live(values: Mapping[str, str]) -> list[NodeSpec]:
         queue_policy="drop_oldest",
         image_topic=values["image_topic"],
         monitor=_monitor(values),
+        arrangement=values["arrangement"],
     )
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
     source = replayed(values["bag"], values["topic"])
-    return chain(source, calibration=values["calibration"], output=values["output"], monitor=_monitor(values))
+    return chain(
+        source,
+        calibration=values["calibration"],
+        output=values["output"],
+        monitor=_monitor(values),
+        arrangement=values["arrangement"],
+    )
 
 
 def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -187,7 +209,13 @@ def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
         seed=int(values["seed"]),
         optics_seed=int(values["optics_seed"]),
     )
-    return chain(source, calibration=values["calibration"], output=values["output"], monitor=_monitor(values))
+    return chain(
+        source,
+        calibration=values["calibration"],
+        output=values["output"],
+        monitor=_monitor(values),
+        arrangement=values["arrangement"],
+    )
 
 
 def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -202,6 +230,7 @@ def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
         output=values["output"],
         controller=controller,
         monitor=_monitor(values),
+        arrangement=values["arrangement"],
     )
 
 
@@ -213,6 +242,12 @@ def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
 
 _CALIBRATION = {"calibration": ("", "Calibration file; empty: x and y only")}
 _OUTPUT = {"output": ("", "Directory of the bag to record; empty: none")}
+_ARRANGEMENT = {
+    "arrangement": (
+        "processes",
+        "processes: one for each node; pipeline: source, localizer and pose in one, for the lowest latency",
+    )
+}
 _MONITOR = {"monitor": ("false", "true: show it live to browsers on this machine, see docs/monitor.md")}
 _CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
 _NAMESPACE = {"namespace": ("", "Namespace of the nodes and their topics")}
@@ -231,6 +266,7 @@ SYSTEMS = {
             "rate": ("10.0", "Frames per second; 0.0: as the source delivers them"),
             "image_topic": (topics.IMAGE, "Topic of the images"),
             **_OUTPUT,
+            **_ARRANGEMENT,
             **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
@@ -244,6 +280,7 @@ SYSTEMS = {
             "topic": ("", "Topic of its images; empty: the only one, or the only one named image_raw"),
             **_CALIBRATION,
             **_OUTPUT,
+            **_ARRANGEMENT,
             **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
@@ -257,6 +294,7 @@ SYSTEMS = {
             "cycles": ("80", "Motion cycles; 80 are a revolution"),
             **_SIMULATION,
             **_OUTPUT,
+            **_ARRANGEMENT,
             **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,
@@ -270,6 +308,7 @@ SYSTEMS = {
             "law": ("", "module:Class of the law that decides the motion; empty: the controller's own"),
             **_SIMULATION,
             **_OUTPUT,
+            **_ARRANGEMENT,
             **_MONITOR,
             **_CONFIG,
             **_NAMESPACE,

@@ -21,7 +21,8 @@ def watch_poses(
     on_pose: Callable[[CyclePose], None], namespace: str = ""
 ) -> Iterator[Callable[[float], None]]:
     """Call ``on_pose`` with every pose on this machine; yields ``spin(seconds)``, which lets them come."""
-    os.environ.update(transport.LOCALHOST_ONLY)
+    for name, value in transport.LOCALHOST_ONLY.items():
+        os.environ.setdefault(name, value)
     transport.use_profile(frames=False)
     # Ctrl-C belongs to the program.
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)

@@ -11,15 +11,16 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 
 if TYPE_CHECKING:
     from mems6dof_ros.analysis.truth import TruthComparison
+    from mems6dof_ros.frame import Frame
     from mems6dof_ros.pose.cycle_pose import CyclePose
     from mems6dof_ros.simulation.settings import SimulationSettings
 
@@ -28,7 +29,8 @@ MARKER = "made_by_mems6dof_demo"
 
 #: Two orientations of the bead substrate tell its tilt from the curvature of the field.
 ROTATIONS = (0.0, math.pi)
-AXIAL_RANGE, AXIAL_STEP = 4e-6, 0.25e-6
+#: Scanned beyond what is calibrated, so that particles out of range are known for what they are.
+AXIAL_SCAN, AXIAL_RANGE, AXIAL_STEP = 6e-6, 4e-6, 0.25e-6
 
 BODY = "load_gear"
 
@@ -68,31 +70,50 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--size", type=int, default=2048, help="width and height of the frames, px")
     parser.add_argument("--seed", type=int, default=1, help="particles, motion and noise")
     parser.add_argument("--optics-seed", type=int, default=1, help="aberrations of the objective")
+    parser.add_argument(
+        "--closed-loop",
+        action="store_true",
+        help="instead of letting the gear turn, bring it to random angles by the controller",
+    )
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demonstration; 1 where a cycle was lost or an error exceeds its requirement."""
-    from mems6dof_ros.analysis.report import write_report
-    from mems6dof_ros.cli.interrupt import stop_on_signal
+    """Run the demonstration; 1 where a cycle was lost, an error exceeds its requirement, or a target was
+    missed."""
+    from mems6dof_ros.cli.closed_loop import run_closed_loop
     from mems6dof_ros.simulation.settings import SimulationSettings
 
     settings = SimulationSettings(
         width_px=args.size, height_px=args.size, seed=args.seed, optics_seed=args.optics_seed
     )
+    if args.cycles < 2:
+        raise InputError("--cycles", f"{args.cycles}", "2 or more, 80 for a revolution")
     started = time.monotonic()
     _prepare(args.out)
-    calibration, bag = args.out / "optics.yaml", args.out / "bag"
-    with stop_on_signal() as stopped:
-        _calibrate(settings, calibration, stopped)
-        _say("2/3  measure: frame_source, localizer, pose_estimator and recorder as four processes")
-        _measure(settings, args.cycles, calibration, bag, args.out / "nodes.log", stopped)
-    _say("3/3  report")
-    page = write_report(bag, args.out / "report")
-    passed = _print_result(bag, args.cycles)
-    print(f"\nbag          {bag}\nreport       {page}\ncalibration  {calibration}")
-    print(f"done in {time.monotonic() - started:.0f} s")
+    calibration = args.out / "optics.yaml"
+    _say("1/3  calibrate: bead substrate through focus, in two orientations")
+    _calibrate(settings, calibration)
+    if args.closed_loop:
+        _say("2/3  close the loop: the four nodes and a controller as five processes")
+        passed = run_closed_loop(args.out, calibration=calibration, settings=settings) == 0
+    else:
+        passed = _turn(settings, args.cycles, calibration, args.out)
+    print(f"calibration  {calibration}\ndone in {time.monotonic() - started:.0f} s")
     return 0 if passed else 1
+
+
+def _turn(settings: SimulationSettings, cycles: int, calibration: Path, out: Path) -> bool:
+    from mems6dof_ros.analysis.report import write_report
+
+    bag = out / "bag"
+    _say("2/3  measure: frame_source, localizer, pose_estimator and recorder as four processes")
+    _measure(settings, cycles, calibration, bag, out / "nodes.log")
+    _say("3/3  report")
+    page = write_report(bag, out / "report")
+    passed = _print_result(bag, cycles)
+    print(f"\nbag          {bag}\nreport       {page}")
+    return passed
 
 
 def _say(text: str) -> None:
@@ -109,7 +130,7 @@ def _prepare(out: Path) -> None:
     (out / MARKER).touch()
 
 
-def _calibrate(settings: SimulationSettings, path: Path, stopped: Any) -> None:
+def _calibrate(settings: SimulationSettings, path: Path) -> None:
     from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
     from mems6dof_ros.calibration.file import save_calibration
     from mems6dof_ros.calibration.focus_stack import measure_stack
@@ -118,32 +139,29 @@ def _calibrate(settings: SimulationSettings, path: Path, stopped: Any) -> None:
     from mems6dof_ros.simulation.experiment import focus_stack
     from mems6dof_ros.sources.simulator import camera_noise
 
-    _say("1/3  calibrate: bead substrate through focus, in two orientations")
     stacks = []
-    planes = round(2 * AXIAL_RANGE / AXIAL_STEP) + 1
+    planes = round(2 * AXIAL_SCAN / AXIAL_STEP) + 1
     for rotation in ROTATIONS:
-        frames = focus_stack(settings, -AXIAL_RANGE, AXIAL_RANGE, AXIAL_STEP, substrate_rotation=rotation)
+        frames = focus_stack(settings, -AXIAL_SCAN, AXIAL_SCAN, AXIAL_STEP, substrate_rotation=rotation)
         with Progress(f"     planes, substrate at {math.degrees(rotation):.0f} degrees") as progress:
-
-            def counted(frames: Any = frames, progress: Progress = progress) -> Any:
-                for plane, frame in enumerate(frames, 1):
-                    if stopped():
-                        raise KeyboardInterrupt
-                    progress(plane, planes)
-                    yield frame
-
+            shown = _counted(frames, lambda done, progress=progress: progress(done, planes))
             name = f"simulated focus stack, substrate at {math.degrees(rotation):.0f} degrees"
-            stacks.append(measure_stack(counted(), camera_noise(settings), WEIGHTING, WINDOW_PX, name))
-    result = calibrate(stacks, CalibrationSettings(rotations=ROTATIONS), lambda text: _say(f"     {text}"))
+            stacks.append(measure_stack(shown, camera_noise(settings), WEIGHTING, WINDOW_PX, name))
+    settled = CalibrationSettings(axial_range=AXIAL_RANGE, rotations=ROTATIONS)
+    result = calibrate(stacks, settled, lambda text: _say(f"     {text}"))
     save_calibration(result.calibration, path)
     _say(
         f"     {len(result.beads)} beads, {len(result.rejected)} rejected, method {result.calibration.method}"
     )
 
 
-def _measure(
-    settings: SimulationSettings, cycles: int, calibration: Path, bag: Path, log: Path, stopped: Any
-) -> None:
+def _counted(frames: Iterable[Frame], count: Callable[[int], None]) -> Iterator[Frame]:
+    for done, frame in enumerate(frames, 1):
+        count(done)
+        yield frame
+
+
+def _measure(settings: SimulationSettings, cycles: int, calibration: Path, bag: Path, log: Path) -> None:
     """Run the nodes until every frame has become a pose; raises Mems6dofError where a node fails."""
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
@@ -174,8 +192,6 @@ def _measure(
         with watch_poses(on_pose) as spin, run_system(nodes, on_line=on_line) as running:
             while "frame_source" not in (ended := running.poll()) and not any(ended.values()):
                 spin(0.1)
-                if stopped():
-                    raise KeyboardInterrupt
             codes = running.stop()
     if failed := {name: code for name, code in codes.items() if code}:
         tail = "\n".join(log.read_text(encoding="utf-8").splitlines()[-5:])

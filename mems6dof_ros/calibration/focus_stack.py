@@ -23,6 +23,8 @@ from mems6dof_ros.localization.localizations import Flag, GaussianFits
 Progress = Callable[[int, int], None]
 
 LEAST_PLANES = 8
+#: Side of the fitted window: holds a particle up to 4 um out of focus.
+DEFAULT_WINDOW_PX = 41
 #: Beads nearer to each other than this part of the window disturb each other when out of focus.
 _NEIGHBOUR = 0.75
 #: A bead must be fitted in one run through focus, at least this part of the median bead's.

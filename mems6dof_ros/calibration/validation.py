@@ -20,7 +20,7 @@ from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
 from mems6dof_ros.calibration.estimator import METHODS
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.file import Calibration
-from mems6dof_ros.calibration.focus_stack import FocusStack, measure_stack
+from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, FocusStack, measure_stack
 from mems6dof_ros.calibration.real_stacks import (
     astigmatic_stack,
     intrinsic_stack,
@@ -42,7 +42,6 @@ from mems6dof_ros.sources.simulator import camera_noise
 Figure = dict[str, Any]
 Progress = Callable[[int, int], None]
 
-WINDOW_PX = 41
 #: The stacks reach beyond the range that the calibration declares valid.
 STACK_REACH, STACK_STEP, VALID_RANGE = 6.6e-6, 0.2e-6, 4.2e-6
 
@@ -83,7 +82,9 @@ def simulated_stack(optics: str, seed: int, electrons: float, **settings: Any) -
         clumps=0, optics=optics, optics_seed=seed, electrons=electrons, seed=seed, **settings
     )
     frames = focus_stack(simulated, -STACK_REACH, STACK_REACH, STACK_STEP, beads=150, seed=10 + seed)
-    return measure_stack(frames, camera_noise(simulated), DEFAULT_WEIGHTING, WINDOW_PX, f"{optics} {seed}")
+    return measure_stack(
+        frames, camera_noise(simulated), DEFAULT_WEIGHTING, DEFAULT_WINDOW_PX, f"{optics} {seed}"
+    )
 
 
 def calibrated(optics: str, seed: int, electrons: float, **settings: Any) -> Calibration:
@@ -113,7 +114,7 @@ def held_out(
         frame = BeadSubstrate(simulated, beads=150, seed=1000 * seed + number + 500).frame(float(stage_z))
         truth = frame.truth[0]
         px = truth.position[:, :2] / simulated.pixel_size + (size - 1) / 2
-        inside = ((px > WINDOW_PX // 2) & (px < size - WINDOW_PX // 2)).all(axis=1)
+        inside = ((px > DEFAULT_WINDOW_PX // 2) & (px < size - DEFAULT_WINDOW_PX // 2)).all(axis=1)
         guess = px[inside] + rng.uniform(-1, 1, (int(inside.sum()), 2))
         fits = fit_gaussians(
             frame.image, guess, calibration.camera, calibration.weighting, calibration.window_px
@@ -165,7 +166,7 @@ def axial_bound(particles: Sequence[Particles], seed: int, background: float, re
 
         middle = images((0, 0, 0))
         half = middle.shape[1] // 2
-        centre = slice(half - WINDOW_PX // 2, half + WINDOW_PX // 2 + 1)
+        centre = slice(half - DEFAULT_WINDOW_PX // 2, half + DEFAULT_WINDOW_PX // 2 + 1)
         derivatives = []
         for axis in range(3):
             shift = [step * (axis == k) for k in range(3)]
@@ -325,7 +326,7 @@ def bad_stack_figures(seeds: Sequence[int]) -> list[Figure]:
 
     def outcome(stack: Sequence[Frame], reference: Calibration | None = None) -> str:
         try:
-            measured = measure_stack(stack, camera, DEFAULT_WEIGHTING, WINDOW_PX, "stack")
+            measured = measure_stack(stack, camera, DEFAULT_WEIGHTING, DEFAULT_WINDOW_PX, "stack")
             result = calibrate(
                 [measured], CalibrationSettings(numerical_aperture=aperture, reference=reference)
             )
@@ -333,7 +334,9 @@ def bad_stack_figures(seeds: Sequence[int]) -> list[Figure]:
             return str(error)
         return "; ".join(result.warnings)
 
-    good = calibrate([measure_stack(frames, camera, DEFAULT_WEIGHTING, WINDOW_PX, "stack")]).calibration
+    good = calibrate(
+        [measure_stack(frames, camera, DEFAULT_WEIGHTING, DEFAULT_WINDOW_PX, "stack")]
+    ).calibration
     drifting = [replace(f, image=np.roll(f.image, round(0.4 * k), axis=1)) for k, f in enumerate(frames)]
     ceiling = int(0.3 * max(f.image.max() for f in frames))
     saturated = [replace(f, image=np.minimum(f.image, np.uint16(ceiling))) for f in frames]

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from mems6dof_ros.cli.inputs import add_camera_options, add_image_options, camera_of, open_input
 
-WINDOW_PX = 41
-WEIGHTING = "relative_light_weighting"
-
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Options: what the stacks are, the camera, the fit, the model, where results go."""
+    from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX
+    from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
+
     parser = subparsers.add_parser(
         "calibrate",
         help="calibrate the optics from focus stacks of beads",
@@ -29,9 +29,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     add_camera_options(parser)
     fit = parser.add_argument_group("fit and model")
     fit.add_argument(
-        "--window", type=int, default=WINDOW_PX, help="side of the window, px (default: %(default)s)"
+        "--window", type=int, default=DEFAULT_WINDOW_PX, help="side of the window, px (default: %(default)s)"
     )
-    fit.add_argument("--weighting", default=WEIGHTING, help="weighting of the fit (default: %(default)s)")
+    fit.add_argument(
+        "--weighting", default=DEFAULT_WEIGHTING, help="weighting of the fit (default: %(default)s)"
+    )
     fit.add_argument("--axial-range", type=float, help="largest |defocus| to declare valid, m")
     fit.add_argument("--aperture", type=float, help="numerical aperture, to check the stage's step")
     fit.add_argument("--reference", help="earlier calibration of these optics, to check step and direction")

@@ -7,11 +7,10 @@ what was recorded. Nothing passes from the first to the second but the calibrati
 from __future__ import annotations
 
 import argparse
-import math
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,17 +19,11 @@ from mems6dof_ros.errors import InputError, Mems6dofError
 
 if TYPE_CHECKING:
     from mems6dof_ros.analysis.truth import TruthComparison
-    from mems6dof_ros.frame import Frame
     from mems6dof_ros.pose.cycle_pose import CyclePose
     from mems6dof_ros.simulation.settings import SimulationSettings
 
 #: Marks a directory that a demonstration has made, and that the next one may replace.
 MARKER = "made_by_mems6dof_demo"
-
-#: Two orientations of the bead substrate tell its tilt from the curvature of the field.
-ROTATIONS = (0.0, math.pi)
-#: Scanned beyond what is calibrated, so that particles out of range are known for what they are.
-AXIAL_SCAN, AXIAL_RANGE, AXIAL_STEP = 6e-6, 4e-6, 0.25e-6
 
 BODY = "load_gear"
 
@@ -131,34 +124,16 @@ def _prepare(out: Path) -> None:
 
 
 def _calibrate(settings: SimulationSettings, path: Path) -> None:
-    from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
+    from mems6dof_ros.analysis.simulated import calibrate_simulated
     from mems6dof_ros.calibration.file import save_calibration
-    from mems6dof_ros.calibration.focus_stack import measure_stack
-    from mems6dof_ros.cli.calibrate import WEIGHTING, WINDOW_PX
     from mems6dof_ros.cli.progress import Progress
-    from mems6dof_ros.simulation.experiment import focus_stack
-    from mems6dof_ros.sources.simulator import camera_noise
 
-    stacks = []
-    planes = round(2 * AXIAL_SCAN / AXIAL_STEP) + 1
-    for rotation in ROTATIONS:
-        frames = focus_stack(settings, -AXIAL_SCAN, AXIAL_SCAN, AXIAL_STEP, substrate_rotation=rotation)
-        with Progress(f"     planes, substrate at {math.degrees(rotation):.0f} degrees") as progress:
-            shown = _counted(frames, lambda done, progress=progress: progress(done, planes))
-            name = f"simulated focus stack, substrate at {math.degrees(rotation):.0f} degrees"
-            stacks.append(measure_stack(shown, camera_noise(settings), WEIGHTING, WINDOW_PX, name))
-    settled = CalibrationSettings(axial_range=AXIAL_RANGE, rotations=ROTATIONS)
-    result = calibrate(stacks, settled, lambda text: _say(f"     {text}"))
+    with Progress("     planes") as progress:
+        result = calibrate_simulated(settings, progress)
     save_calibration(result.calibration, path)
     _say(
         f"     {len(result.beads)} beads, {len(result.rejected)} rejected, method {result.calibration.method}"
     )
-
-
-def _counted(frames: Iterable[Frame], count: Callable[[int], None]) -> Iterator[Frame]:
-    for done, frame in enumerate(frames, 1):
-        count(done)
-        yield frame
 
 
 def _measure(settings: SimulationSettings, cycles: int, calibration: Path, bag: Path, log: Path) -> None:

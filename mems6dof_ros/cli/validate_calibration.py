@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from textwrap import shorten
 
-from mems6dof_ros import __version__
-
-_WIDTH = 78
+from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -24,7 +20,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--seeds", type=int, nargs="+", default=[1, 2, 3], help="optics to average over (default: 1 2 3)"
     )
     parser.add_argument("--real-data", type=Path, help="folder of the real focus stacks")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -35,18 +31,5 @@ def run(args: argparse.Namespace) -> int:
 
     with Progress("validate calibration") as progress:
         table = figures(args.seeds, args.real_data, progress)
-    for row in table:
-        verdict = {True: "pass", False: "FAIL", None: ""}[row["passed"]]
-        quantity = shorten(row["quantity"], _WIDTH)
-        print(f"{quantity:<{_WIDTH}}  {row['measured']:>8.4g}  {row['required']:<12}  {verdict}".rstrip())
-    failed = sum(row["passed"] is False for row in table)
-    print(f"{sum(row['passed'] is True for row in table)} passed, {failed} failed")
-    if args.json:
-        record = {
-            "format": "mems6dof validation 1",
-            "software_version": __version__,
-            "parameters": {"seeds": args.seeds},
-            "figures": table,
-        }
-        args.json.write_text(json.dumps(record, indent=1) + "\n")
-    return 1 if failed else 0
+    print_table(table)
+    return conclude(table, {"seeds": args.seeds}, args.json)

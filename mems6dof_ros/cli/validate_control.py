@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mems6dof_ros import __version__
+from mems6dof_ros.cli.figures import add_json_option, conclude
 
 if TYPE_CHECKING:
     from mems6dof_ros.simulation.settings import SimulationSettings
@@ -31,7 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--seed", type=int, default=1, help="particles, motion, noise, targets")
     parser.add_argument("--calibration", type=Path, help="of the simulated optics (default: made here)")
     parser.add_argument("--no-ros", action="store_true", help="only what needs neither frames nor ROS 2")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -48,23 +47,15 @@ def run(args: argparse.Namespace) -> int:
         settings = SimulationSettings(width_px=args.size, height_px=args.size, seed=args.seed)
         with tempfile.TemporaryDirectory() as folder:
             rows += _real(settings, args.targets, args.calibration, Path(folder))
-    failed = sum(not row["passed"] for row in rows)
-    print(f"\n{len(rows) - failed} passed, {failed} failed")
-    if args.json:
-        record = {
-            "format": "mems6dof validation 1",
-            "software_version": __version__,
-            "parameters": {
-                "drives": args.drives,
-                "targets": args.targets,
-                "size": args.size,
-                "seed": args.seed,
-                "no_ros": args.no_ros,
-            },
-            "figures": rows,
-        }
-        args.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return 1 if failed else 0
+    print()
+    parameters = {
+        "drives": args.drives,
+        "targets": args.targets,
+        "size": args.size,
+        "seed": args.seed,
+        "no_ros": args.no_ros,
+    }
+    return conclude(rows, parameters, args.json)
 
 
 def _row(quantity: str, measured: float, limit: float) -> dict[str, Any]:
@@ -130,13 +121,17 @@ def _real(
     """The same through ROS 2, from rendered frames."""
     import numpy as np
 
+    from mems6dof_ros.analysis.simulated import calibrate_simulated
+    from mems6dof_ros.calibration.file import save_calibration
     from mems6dof_ros.cli.closed_loop import stage_table, summary
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.control.validation import open_loop, random_targets
     from mems6dof_ros.nodes.closed_loop import approach, closed_loop, data_sheet, safe_stops
 
     if calibration is None:
-        calibration = _calibrate(settings, folder / "optics.yaml")
+        calibration = folder / "optics.yaml"
+        with Progress("validate control: planes of the focus stacks") as progress:
+            save_calibration(calibrate_simulated(settings, progress).calibration, calibration)
     drive, angles = data_sheet(settings), random_targets(targets, settings.seed)
     with (
         closed_loop(settings, calibration, folder / "nodes.log") as (client, _),
@@ -160,28 +155,6 @@ def _real(
         rows.append(_row(f"cycles after: {name}", cycles, 1))
         print(f"{name:34}{cycles:3d}  {_verdict(rows[-1])}  {reason}")
     return rows
-
-
-def _calibrate(settings: SimulationSettings, path: Path) -> Path:
-    """A calibration of the simulated optics, from two orientations of a bead substrate."""
-    import math
-
-    from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
-    from mems6dof_ros.calibration.file import save_calibration
-    from mems6dof_ros.calibration.focus_stack import measure_stack
-    from mems6dof_ros.cli.calibrate import WEIGHTING, WINDOW_PX
-    from mems6dof_ros.cli.progress import Progress
-    from mems6dof_ros.simulation.experiment import focus_stack
-    from mems6dof_ros.sources.simulator import camera_noise
-
-    rotations, stacks = (0.0, math.pi), []
-    with Progress("validate control: focus stacks") as progress:
-        for rotation in rotations:
-            frames = focus_stack(settings, -4e-6, 4e-6, 0.25e-6, substrate_rotation=rotation)
-            stacks.append(measure_stack(frames, camera_noise(settings), WEIGHTING, WINDOW_PX, "simulated"))
-            progress(len(stacks), len(rotations))
-    save_calibration(calibrate(stacks, CalibrationSettings(rotations=rotations)).calibration, path)
-    return path
 
 
 def _rms(values: Any) -> float:

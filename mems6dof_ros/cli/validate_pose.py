@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
-from pathlib import Path
 
-from mems6dof_ros import __version__
+from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -28,7 +26,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="also run so many cycles from rendered frames, calibration included, for the first three seeds:"
         " minutes (default: none)",
     )
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -42,24 +40,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--drift-cycles", f"{args.drift_cycles}", "200 or more")
     with Progress("validate pose") as progress:
         table = figures(args.seeds, progress, args.drift_cycles, args.optical_cycles)
-    width = max(len(row["quantity"]) for row in table)
-    for row in table:
-        verdict = {True: "pass", False: "FAIL", None: ""}[row["passed"]]
-        print(
-            f"{row['quantity']:<{width}}  {row['measured']:>10.4g}  {row['required']:<12}  {verdict}".rstrip()
-        )
-    failed = sum(row["passed"] is False for row in table)
-    print(f"{sum(row['passed'] is True for row in table)} passed, {failed} failed")
-    if args.json:
-        record = {
-            "format": "mems6dof validation 1",
-            "software_version": __version__,
-            "parameters": {
-                "seeds": args.seeds,
-                "drift_cycles": args.drift_cycles,
-                "optical_cycles": args.optical_cycles,
-            },
-            "figures": table,
-        }
-        args.json.write_text(json.dumps(record, indent=1) + "\n")
-    return 1 if failed else 0
+    parameters = {
+        "seeds": args.seeds,
+        "drift_cycles": args.drift_cycles,
+        "optical_cycles": args.optical_cycles,
+    }
+    print_table(table)
+    return conclude(table, parameters, args.json)

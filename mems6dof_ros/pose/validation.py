@@ -251,26 +251,14 @@ def optical_chain(
 ) -> TruthComparison:
     """The whole way: calibrate simulated optics from focus stacks, render ``cycles`` of the turning gear,
     localize, estimate; everything from ``seed``. Minutes."""
-    from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
-    from mems6dof_ros.calibration.focus_stack import measure_stack
-    from mems6dof_ros.cli.calibrate import WEIGHTING, WINDOW_PX
+    from mems6dof_ros.analysis.simulated import calibrate_simulated
     from mems6dof_ros.localization.localizer import Localizer
-    from mems6dof_ros.simulation.experiment import focus_stack, motion_frames
+    from mems6dof_ros.simulation.experiment import motion_frames
     from mems6dof_ros.simulation.settings import SimulationSettings
     from mems6dof_ros.sources.simulator import camera_noise
 
     settings = SimulationSettings.from_dict({"seed": seed, "optics_seed": seed, "electrons": electrons})
-    rotations = (0.0, math.pi)
-    stacks = [
-        measure_stack(
-            focus_stack(settings, -4e-6, 4e-6, 0.25e-6, substrate_rotation=rotation),
-            camera_noise(settings), WEIGHTING, WINDOW_PX, f"substrate at {rotation:.2f} rad",
-        )
-        for rotation in rotations
-    ]  # fmt: skip
-    calibration: Any = calibrate(
-        stacks, CalibrationSettings(rotations=rotations), lambda text: None
-    ).calibration
+    calibration = calibrate_simulated(settings).calibration
     localizer, estimator = Localizer(camera_noise(settings), calibration), PoseEstimator()
     poses, truths = [], []
     for index, frame in enumerate(motion_frames(settings, cycles), 1):

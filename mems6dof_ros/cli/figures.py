@@ -1,0 +1,45 @@
+"""What every `mems6dof validate` ends with: a table of figures, a file of them, an exit status."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mems6dof_ros import __version__
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """``--json FILE``, for ``conclude``."""
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+
+
+def print_table(figures: Sequence[Mapping[str, Any]]) -> None:
+    """One line a figure: ``quantity``, ``measured`` (NaN: a remark), ``required`` and whether it ``passed``
+    (None: for information)."""
+    measurements = [row for row in figures if not math.isnan(row["measured"])]
+    width = max((len(row["quantity"]) for row in measurements), default=0)
+    wanted = max((len(row["required"]) for row in figures), default=0)
+    for row in figures:
+        verdict = {True: "pass", False: "FAIL", None: ""}[row["passed"]]
+        measured = "" if math.isnan(row["measured"]) else f"{row['measured']:.4g}"
+        print(f"{row['quantity']:<{width}}  {measured:>10}  {row['required']:<{wanted}}  {verdict}".rstrip())
+
+
+def conclude(figures: Sequence[Mapping[str, Any]], parameters: Mapping[str, Any], path: Path | None) -> int:
+    """Count the verdicts, write the figures to ``path`` where there is one; returns the exit status: 1 where
+    a figure missed its requirement, or nothing was measured."""
+    passed, failed = (sum(row["passed"] is verdict for row in figures) for verdict in (True, False))
+    print(f"{passed} passed, {failed} failed")
+    if path:
+        record = {
+            "format": "mems6dof validation 1",
+            "software_version": __version__,
+            "parameters": dict(parameters),
+            "figures": list(figures),
+        }
+        path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return 1 if failed or not passed else 0

@@ -12,7 +12,6 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from mems6dof_ros.analysis.recording import Recording
@@ -65,55 +64,34 @@ def style() -> Iterator[None]:
 
 
 def degrees_of_freedom(poses: Sequence[CyclePose], comparison: TruthComparison | None) -> Figure:
-    """Six degrees of freedom against motion cycle, with bands of two standard deviations, and truth."""
-    figure, axes = _grid(3, 2, (10, 7.2))
+    """Six degrees of freedom against motion cycle, with bars of two standard deviations, and truth."""
+    figure, axes = grid(3, 2, (10, 7.2))
     cycle, values, spread = _cycles(poses), _displacements(poses), _spreads(poses)
     true = _true_displacements(poses, comparison)
     for i, name in enumerate(DEGREES_OF_FREEDOM):
         axis = axes[i % 3][i // 3]
         symbol, unit, scale = DISPLAY[name]
         value, truth = values[:, i].copy(), true[:, i].copy()
-        precision = f"1 sd: {_quantity(np.nanmedian(spread[:, i]), unit)}"
-        title = f"{symbol}    {precision}"
+        precision = f"1 sd: {quantity(np.nanmedian(spread[:, i]), unit)}"
+        if comparison is not None:
+            precision += f", error {quantity(comparison.rms[i], unit)} rms"
         if name == "psi":
             uniform, step = _uniform_rotation(poses)
             value, truth = value - uniform, truth - uniform
-            title = f"{symbol} beyond {_number(step * scale, 5)} mrad per cycle    {precision}"
-        _band(axis, poses, cycle, value * scale, spread[:, i] * scale)
+            symbol = f"{symbol} less {number(step * scale, 5)} mrad/cycle"
         if np.isfinite(truth).any():
-            axis.plot(cycle, truth * scale, ".", color=BLACK, ms=2.5, label="truth", zorder=4)
-        axis.set_title(title)
+            axis.plot(cycle, truth * scale, color=BLACK, lw=0.8, label="truth")
+        else:
+            axis.plot(cycle, value * scale, color=BLUE, lw=0.5, alpha=0.5)
+        size = float(np.clip(40 / math.sqrt(len(poses)), 1.5, 4))
+        bars = {"fmt": "o", "color": BLUE, "ms": size, "ecolor": BLUE, "elinewidth": 0.9, "zorder": 3}
+        axis.errorbar(cycle, value * scale, 2 * spread[:, i] * scale, label="measured ± 2 sd", **bars)
+        axis.set_title(f"{symbol}    {precision}")
         axis.set_ylabel(unit)
         _mark(axis, poses)
     for row in axes[-1]:
         row.set_xlabel("motion cycle")
-    if comparison is not None:
-        axes[0][0].legend(loc="upper right")
-    return figure
-
-
-def paths(poses: Sequence[CyclePose]) -> Figure:
-    """Path of the centre in the plane and of the tilt, coloured by the rotation."""
-    figure, axes = _grid(1, 2, (10, 4.6), sharex=False)
-    values, spread = _displacements(poses), _spreads(poses)
-    phase = np.degrees(values[:, 5]) % 360
-    for axis, (i, j) in zip(axes[0], ((0, 1), (3, 4)), strict=True):
-        names = [DISPLAY[DEGREES_OF_FREEDOM[k]] for k in (i, j)]
-        scale = names[0][2]
-        x, y = values[:, i] * scale, values[:, j] * scale
-        axis.plot(x, y, color="#C9CDD3", lw=0.6, zorder=1)
-        points = axis.scatter(x, y, c=phase, cmap="twilight_shifted", vmin=0, vmax=360, s=12, zorder=2)
-        sd = np.nanmedian(spread[:, [i, j]], axis=0) * scale
-        for pose_x, pose_y in zip(x, y, strict=True):
-            if np.isfinite(pose_x):
-                ellipse = Ellipse((pose_x, pose_y), 4 * sd[0], 4 * sd[1], fill=False, color=GREY, lw=0.5)
-                axis.add_patch(ellipse)
-        axis.set_aspect("equal", "datalim")
-        axis.set_xlabel(f"{names[0][0]} ({names[0][1]})")
-        axis.set_ylabel(f"{names[1][0]} ({names[1][1]})")
-    axes[0][0].set_title("Path of the centre (ellipses: 2 sd)")
-    axes[0][1].set_title("Path of the tilt (ellipses: 2 sd)")
-    figure.colorbar(points, ax=axes[0].tolist(), label="ψ (deg)", ticks=[0, 90, 180, 270, 360], shrink=0.8)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
 
 
@@ -128,7 +106,7 @@ def rotation(poses: Sequence[CyclePose]) -> Figure:
     above.errorbar(cycle, value * 1e3, 2 * spread * 1e3, fmt="o", color=BLUE, ecolor=GREY, elinewidth=0.8)
     above.set_ylabel("mrad per cycle")
     if len(value):
-        title = f"Rotation per motion cycle (bars: 2 sd; 1 sd: {_number(np.median(spread) * 1e6)} µrad)"
+        title = f"Rotation per motion cycle (bars: 2 sd; 1 sd: {number(np.median(spread) * 1e6)} µrad)"
         above.set_title(title)
         beside.hist(value * 1e3, bins="auto", orientation="horizontal", color=BLUE, alpha=0.75)
     beside.set_xlabel("cycles")
@@ -151,7 +129,7 @@ def rotation(poses: Sequence[CyclePose]) -> Figure:
 
 def paper_angles(poses: Sequence[CyclePose]) -> Figure:
     """Precession and nutation; what noise leaves undetermined is left out or pale."""
-    figure, axes = _grid(2, 1, (10, 4.6))
+    figure, axes = grid(2, 1, (10, 4.6))
     cycle = _cycles(poses)
     beta = np.array([pose.angles.beta for pose in poses]) * 1e3
     sd_beta = np.array([pose.angles.sd_beta for pose in poses]) * 1e3
@@ -182,10 +160,13 @@ def paper_angles(poses: Sequence[CyclePose]) -> Figure:
 
 
 def residuals(poses: Sequence[CyclePose]) -> Figure:
-    """Residuals of the rigid transform: by cycle, by particle, and against what was claimed."""
+    """Residuals of the rigid transform: by cycle, by particle, and against what was claimed.
+
+    A cycle that founds a constellation agrees with itself, by definition, and is left out."""
     figure = Figure(figsize=(10, 6))
     grid = figure.add_gridspec(2, 6)
     cycle = _cycles(poses)
+    founding = np.array([pose.valid and not np.nan_to_num(pose.residual).any() for pose in poses])
     panels = (
         ("Residual in x and y", "nm rms", [pose.residual_rms_xy * 1e9 for pose in poses]),
         ("Residual in z", "nm rms", [pose.residual_rms_z * 1e9 for pose in poses]),
@@ -193,15 +174,17 @@ def residuals(poses: Sequence[CyclePose]) -> Figure:
     )
     for k, (title, unit, values) in enumerate(panels):
         axis = figure.add_subplot(grid[0, 2 * k : 2 * k + 2])
-        axis.plot(cycle, values, ".", color=BLUE)
-        median = np.nanmedian(values)
+        shown = np.where(founding, np.nan, values)
+        axis.plot(cycle, shown, ".", color=BLUE)
+        median = float(np.nanmedian(shown)) if np.isfinite(shown).any() else math.nan
         axis.axhline(median, color=GREY, lw=0.8)
-        axis.set_title(f"{title}, median {_number(median)}")
+        axis.set_title(f"{title}, median {number(median)}")
         axis.set_ylabel(unit)
         axis.set_xlabel("motion cycle")
         axis.set_ylim(bottom=0)
         _mark(axis, poses)
-    every = np.concatenate([pose.residual for pose in poses if pose.valid] or [np.zeros((0, 3))]) * 1e9
+    parts = [pose.residual for pose, own in zip(poses, founding, strict=True) if pose.valid and not own]
+    every = np.concatenate(parts or [np.zeros((0, 3))]) * 1e9
     for k, name in enumerate("xyz"):
         axis = figure.add_subplot(grid[1, 2 * k : 2 * k + 2])
         part = every[np.isfinite(every[:, k]), k]
@@ -210,14 +193,14 @@ def residuals(poses: Sequence[CyclePose]) -> Figure:
             span = 5 * max(robust, 1e-3)
             axis.hist(np.clip(part, -span, span), bins=61, range=(-span, span), color=BLUE, alpha=0.75)
             axis.set_yscale("log")
-            axis.set_title(f"All residuals in {name}, rms {_number(np.sqrt((part**2).mean()))} nm")
+            axis.set_title(f"All residuals in {name}, rms {number(np.sqrt((part**2).mean()))} nm")
         axis.set_xlabel("nm")
     return figure
 
 
 def constellation(recording: Recording, body: str) -> Figure:
     """The particles in the body frame with their heights, and the mean residuals over the field."""
-    figure, axes = _grid(1, 2, (10, 4.9), sharex=False)
+    figure, axes = grid(1, 2, (10, 4.9), sharex=False)
     particles = recording.constellation(body, recording.last_version(body))
     x, y, z = particles.position.T * 1e6
     left, right = axes[0]
@@ -234,6 +217,8 @@ def constellation(recording: Recording, body: str) -> Figure:
         lateral = np.hypot(*vector[:, :2].T) * 1e9
         arrows = right.quiver(*place.T * 1e6, *(vector[:, :2].T * 1e9), lateral, cmap="viridis", pivot="mid")
         figure.colorbar(arrows, ax=right, label="mean residual in x, y (nm)", shrink=0.7)
+        half = 1.1e6 * float(np.abs(place).max())
+        right.set(xlim=(-half, half), ylim=(-half, half))
     right.set_title("Residuals that stay in the field" if len(place) else "Too few residuals for a map")
     for axis in (left, right):
         axis.set_aspect("equal")
@@ -245,7 +230,7 @@ def constellation(recording: Recording, body: str) -> Figure:
 
 def particles(poses: Sequence[CyclePose]) -> Figure:
     """Particles seen, expected and used, by cycle."""
-    figure, axes = _grid(1, 1, (10, 2.4))
+    figure, axes = grid(1, 1, (10, 2.4))
     axis, cycle = axes[0][0], _cycles(poses)
     for name, color in (("seen", GREY), ("expected", ORANGE), ("used", BLUE)):
         counts = [getattr(pose, f"particles_{name}") for pose in poses]
@@ -260,7 +245,7 @@ def particles(poses: Sequence[CyclePose]) -> Figure:
 
 def truth_errors(poses: Sequence[CyclePose], comparison: TruthComparison) -> Figure:
     """Errors against truth with the claimed bands of two standard deviations."""
-    figure, axes = _grid(3, 2, (10, 7.2))
+    figure, axes = grid(3, 2, (10, 7.2))
     rms, claimed = comparison.rms, comparison.claimed_rms
     for i, name in enumerate(DEGREES_OF_FREEDOM):
         axis = axes[i % 3][i // 3]
@@ -272,7 +257,7 @@ def truth_errors(poses: Sequence[CyclePose], comparison: TruthComparison) -> Fig
         axis.axhline(0, color=GREY, lw=0.8)
         axis.plot(comparison.cycle, comparison.error[:, i] * scale, ".", color=RED, label="error")
         axis.set_title(
-            f"{symbol}    rms {_number(rms[i] * scale)}, claimed {_number(claimed[i] * scale)} {unit}"
+            f"{symbol}    rms {number(rms[i] * scale)}, claimed {number(claimed[i] * scale)} {unit}"
         )
         axis.set_ylabel(unit)
         _mark(axis, poses)
@@ -289,7 +274,7 @@ def latency(poses: Sequence[CyclePose]) -> Figure | None:
     known = {name: part for name, part in values.items() if len(part)}
     if not known:
         return None
-    figure, axes = _grid(1, 1, (10, 0.6 + 0.42 * len(known)))
+    figure, axes = grid(1, 1, (10, 0.6 + 0.42 * len(known)))
     axis = axes[0][0]
     for row, (name, part) in enumerate(reversed(known.items())):
         median, most = np.percentile(part, [50, 99])
@@ -338,7 +323,8 @@ def mean_residuals(recording: Recording, body: str, bins: int = 9) -> tuple[Arra
     return (centre / count[:, None])[enough], (total / count[:, None])[enough]
 
 
-def _grid(rows: int, columns: int, size: tuple[float, float], sharex: bool = True) -> tuple[Figure, Any]:
+def grid(rows: int, columns: int, size: tuple[float, float], sharex: bool = True) -> tuple[Figure, Any]:
+    """A figure of ``size`` inches and its axes (rows, columns)."""
     figure = Figure(figsize=size)
     return figure, figure.subplots(rows, columns, squeeze=False, sharex=sharex)
 
@@ -376,16 +362,6 @@ def _uniform_rotation(poses: Sequence[CyclePose]) -> tuple[Array, float]:
     return intercept + slope * cycle, float(slope)
 
 
-def _band(axis: Axes, poses: Sequence[CyclePose], cycle: Array, value: Array, spread: Array) -> None:
-    """A line with a band of two standard deviations, broken where the reference changes."""
-    version = np.array([pose.reference_version for pose in poses])
-    for k in np.unique(version):
-        part = version == k
-        low, high = (value - 2 * spread)[part], (value + 2 * spread)[part]
-        axis.fill_between(cycle[part], low, high, color=BLUE, alpha=0.25, lw=0)
-        axis.plot(cycle[part], value[part], color=BLUE, lw=0.9)
-
-
 def _mark(axis: Axes, poses: Sequence[CyclePose]) -> None:
     """Where there is no pose, and where the reference changes."""
     before = None
@@ -402,10 +378,22 @@ def _finite(values: Sequence[float]) -> Array:
     return array[np.isfinite(array)]
 
 
-def _quantity(value: float, unit: str) -> str:
-    """A small value in SI units, in nm or urad."""
-    return f"{_number(value * 1e9)} nm" if unit == "nm" else f"{_number(value * 1e6)} µrad"
+def quantity(value: float, unit: str) -> str:
+    """A value in SI units: a length where ``unit`` is nm, else an angle."""
+    if unit == "nm":
+        return f"{number(value * 1e9)} nm" if value < 1e-5 else f"{number(value * 1e6)} µm"
+    return f"{number(value * 1e6)} µrad" if value < 1e-3 else f"{number(value * 1e3)} mrad"
 
 
-def _number(value: float, digits: int = 3) -> str:
-    return f"{value:.{digits}g}" if abs(value) < 1e4 else f"{value:.0f}"
+def with_uncertainty(value: float, sd: float, unit: str = "") -> str:
+    """Value and standard uncertainty to the same place, two digits of the uncertainty; without one that is
+    not known."""
+    if not (math.isfinite(sd) and sd > 0 and math.isfinite(value)):
+        return f"{number(value)} {unit}".rstrip()
+    places = max(0, 1 - math.floor(math.log10(sd)))
+    return f"({value:.{places}f} ± {sd:.{places}f}) {unit}".rstrip()
+
+
+def number(value: float, digits: int = 3) -> str:
+    """To so many significant digits, without an exponent for what is large."""
+    return f"{value:#.{digits}g}".rstrip(".") if abs(value) < 1e3 else f"{value:.0f}"

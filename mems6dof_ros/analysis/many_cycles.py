@@ -117,9 +117,11 @@ class ManyCycles:
             ]
         if self.spectrum is not None:
             for order in (1, motion.LOAD_GEAR_TEETH):
+                image = ", image of a lower one" if order > len(self.cycle) / self.turns / 2 else ""
                 for name, value in zip(SPECTRA, self.spectrum.at(order), strict=True):
-                    unit = _UNITS.get(name, "rad")
-                    rows.append((f"amplitude of {name} at order {order}", unit, value))
+                    rows.append(
+                        (f"amplitude of {name} at order {order}{image}", _UNITS.get(name, "rad"), value)
+                    )
         for i, (name, unit) in enumerate(_UNITS.items()):
             if (again := self.repeatability) is not None:
                 rows.append((f"repeatability of {name} at equal psi", unit, again.rms[i]))

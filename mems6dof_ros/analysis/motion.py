@@ -197,12 +197,16 @@ def order_spectrum(values: Array, psi: Array, highest: float = 1.5 * LOAD_GEAR_T
         # Lomb's shift makes sine and cosine orthogonal on these very samples.
         phase = phase - 0.5 * math.atan2(float(np.sin(2 * phase).sum()), float(np.cos(2 * phase).sum()))
         c, s = np.cos(phase), np.sin(phase)
-        in_phase = values.T @ c / max(float(c @ c), 1e-12)
-        quadrature = values.T @ s / max(float(s @ s), 1e-12) if float(s @ s) > 1e-9 * len(psi) else 0.0
-        amplitude[row] = np.hypot(in_phase, quadrature)
-    independent = min(len(order) // 4, len(psi) // 2)
+        # By power: where all samples have one phase, one of the two coefficients is noise alone.
+        power = sum(
+            (values.T @ part) ** 2 / (part @ part) for part in (c, s) if part @ part > 1e-9 * len(psi)
+        )
+        amplitude[row] = np.sqrt(2 * power / len(psi))
+    independent = max(min(len(order) // 4, len(psi) // 2), 1)
+    # Between them the spectrum may be higher: the square root of the level times as likely (Baluev 2008).
+    chances = independent * math.sqrt(math.log(independent / 0.05))
     # Power of white noise at one order: (variance / n) chi-square with 2 degrees of freedom, times 2.
-    level = chi2.ppf(0.95 ** (1 / max(independent, 1)), 2)
+    level = chi2.ppf(0.95 ** (1 / chances), 2)
     threshold = np.sqrt(2 * values.var(axis=0) / len(psi) * level)
     return OrderSpectrum(order, amplitude, threshold)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.rigid import RigidPose, kabsch, shift_origin
 from mems6dof_ros.recording import messages
 from mems6dof_ros.recording.bag import BagReader
+from mems6dof_ros.recording.tables import Table
 
 _POSE = "mems6dof_msgs/msg/Pose6DOF"
 _LOCALIZATIONS = "mems6dof_msgs/msg/Localizations"
@@ -32,6 +34,15 @@ class Constellation:
     position: NDArray[np.float64]
     seen: NDArray[np.int64]
     residual_rms: NDArray[np.float64]
+
+
+#: One row per body and particle, in the body frame of the last reference.
+CONSTELLATION = Table(
+    "constellation",
+    {"body": str, "particle_id": int, "x_m": float, "y_m": float, "z_m": float, "seen": int}
+    | {"residual_rms_x_m": float, "residual_rms_y_m": float, "residual_rms_z_m": float},
+    lambda row: row,
+)
 
 
 @dataclass(frozen=True)
@@ -107,6 +118,12 @@ class Recording:
         np.add.at(known, which, np.isfinite(residual))
         with np.errstate(invalid="ignore"):
             return Constellation(unique, position / seen[:, None], seen, np.sqrt(square / known))
+
+    def constellation_rows(self, body: str) -> list[list[Any]]:
+        """Rows of CONSTELLATION."""
+        known = self.constellation(body, self.last_version(body))
+        parts = zip(known.particle_id, known.position, known.seen, known.residual_rms, strict=True)
+        return [[body, number, *position, seen, *residual] for number, position, seen, residual in parts]
 
 
 def _between(target: Constellation, source: Constellation) -> RigidPose | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mems6dof_ros.analysis.motion import memory_factor
 from mems6dof_ros.analysis.recording import Recording
-from mems6dof_ros.analysis.truth import TruthComparison
+from mems6dof_ros.analysis.truth import compare
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.pose.bodies import relative_pose
 from mems6dof_ros.pose.cycle_pose import CyclePose
@@ -68,15 +68,8 @@ class RelativeMotion:
         ]
 
 
-def relative_motion(
-    recording: Recording,
-    of: str,
-    to: str,
-    truth_of: TruthComparison | None = None,
-    truth_to: TruthComparison | None = None,
-) -> RelativeMotion:
-    """Motion of ``of`` relative to ``to``, each in its last reference; with errors where those of both
-    bodies are given.
+def relative_motion(recording: Recording, of: str, to: str) -> RelativeMotion:
+    """Motion of ``of`` relative to ``to``, each in its last reference.
 
     Raises InputError where fewer than 3 cycles have both.
     """
@@ -111,7 +104,7 @@ def relative_motion(
         np.sqrt(variance_a + variance_b * weight**2),
         ratio,
         sd_ratio,
-        _errors(poses, truth_of, truth_to, weight),
+        _errors(recording, pairs, weight),
     )
 
 
@@ -126,11 +119,13 @@ def _ratio(turned: Array, by: Array) -> tuple[float, float]:
 
 
 def _errors(
-    poses: Sequence[CyclePose], of: TruthComparison | None, to: TruthComparison | None, weight: Array
+    recording: Recording, pairs: Sequence[tuple[CyclePose, CyclePose]], weight: Array
 ) -> Array | None:
-    """Difference of the errors (n, 6) of both bodies, None without the truth of both."""
-    if of is None or to is None:
-        return None
-    a, b = (dict(zip(truth.cycle.tolist(), truth.error, strict=True)) for truth in (of, to))
-    unknown = np.full(6, np.nan)
-    return np.array([a.get(pose.cycle, unknown) - b.get(pose.cycle, unknown) * weight for pose in poses])
+    """Difference of the errors (n, 6) of both bodies, None unless the truth of both is known throughout."""
+    errors = []
+    for poses in zip(*pairs, strict=True):
+        truths = [truth for truth in recording.truth_of(list(poses)) if truth is not None]
+        if len(truths) < len(poses):
+            return None
+        errors.append(compare(poses, truths).error)
+    return np.asarray(errors[0] - errors[1] * weight)

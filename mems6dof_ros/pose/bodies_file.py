@@ -52,7 +52,7 @@ def _estimator(name: str, entry: Any, path: Path, settings: PoseSettings) -> Pos
     where = f"{path}: body {name}"
     entry = _mapping(entry, where, _OF_A_BODY)
     own = _mapping(entry.get("settings"), f"{where}: settings", [item.name for item in fields(PoseSettings)])
-    values = {key: _setting(value, f"{where}: {key}") for key, value in own.items()}
+    values = {key: _setting(key, value, f"{where}: {key}") for key, value in own.items()}
     region = reference = None
     if "region" in entry:
         region = _region(entry["region"], f"{where}: region")
@@ -71,13 +71,18 @@ def _region(entry: Any, where: str) -> Region:
     return Region((x, y), **radii)
 
 
-def _setting(value: Any, where: str) -> Any:
-    """As PoseSettings takes it, which checks it: lists as tuples of numbers."""
-    if isinstance(value, list):
+def _setting(name: str, value: Any, where: str) -> Any:
+    """``value`` in the type that PoseSettings has for ``name``, which checks the rest."""
+    default = getattr(PoseSettings(), name)
+    if default is None or isinstance(default, tuple):
+        if not isinstance(value, list):
+            raise InputError(where, repr(value), "a list of numbers")
         return tuple(_number(item, where) for item in value)
-    if isinstance(value, int) or value in ("map", "previous"):
-        return value
-    return _number(value, where)
+    if isinstance(default, float):
+        return _number(value, where)
+    if type(value) is not type(default):
+        raise InputError(where, repr(value), "a whole number" if isinstance(default, int) else "text")
+    return value
 
 
 def _number(value: Any, where: str) -> float:

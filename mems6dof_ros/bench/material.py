@@ -10,9 +10,9 @@ from typing import Any
 
 from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
 from mems6dof_ros.calibration.file import Calibration, load_calibration, save_calibration
-from mems6dof_ros.calibration.focus_stack import measure_stack
-from mems6dof_ros.cli.calibrate import WEIGHTING, WINDOW_PX
+from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, measure_stack
 from mems6dof_ros.frame import Frame
+from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.simulation.experiment import focus_stack, motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings
@@ -57,7 +57,9 @@ class Material:
             return self.calibration_file
         settings = dataclasses.replace(self.settings, electrons=2e5)
         planes = focus_stack(settings, -4e-6, 4e-6, 0.5e-6 if self.quick else 0.25e-6, beads=150)
-        stack = measure_stack(planes, camera_noise(settings), WEIGHTING, WINDOW_PX, "simulated focus stack")
+        stack = measure_stack(
+            planes, camera_noise(settings), DEFAULT_WEIGHTING, DEFAULT_WINDOW_PX, "simulated focus stack"
+        )
         path = self.directory / "optics.yaml"
         save_calibration(calibrate([stack], CalibrationSettings()).calibration, path)
         return path

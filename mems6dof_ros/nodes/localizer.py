@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -326,6 +327,7 @@ def nothing_found(
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
     transport.keep_large_buffers()
+    cv2.setNumThreads(1)  # the other cores have processes of their own
     return run(LocalizerNode, args)
 
 

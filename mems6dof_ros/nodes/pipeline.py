@@ -11,6 +11,8 @@ import sys
 import time
 from dataclasses import replace
 
+import cv2
+
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.localization.localizations import Latency
@@ -87,6 +89,7 @@ class PipelineNode(frame_source.FrameSourceNode):
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
     transport.keep_large_buffers()
+    cv2.setNumThreads(1)  # the other cores have processes of their own
     return run(PipelineNode, args, frames=True)
 
 

@@ -19,6 +19,7 @@ NODES = {
     "frame_source",
     "localizer",
     "pose_estimator",
+    "pipeline",
     "recorder",
     "controller",
     "monitor",

@@ -1,0 +1,331 @@
+"""The nodes as processes over DDS: rate, losses, latency and memory, beside the bare transport."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mems6dof_ros.bench.material import CYCLES, Material
+from mems6dof_ros.bench.table import Row
+from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.recording import messages, topics
+
+#: Motion cycles per second that the drive of the paper makes.
+DRIVE = 90.0
+#: Most time, s, that nodes may take to render their frames and to answer the first of them.
+START = 240.0
+#: Messages before the clocks run: the constellation is then known.
+WARM_UP = 4 * CYCLES
+
+
+@dataclass(frozen=True)
+class Series:
+    """What came out: ``rate`` 1/s; ``latency`` (n,) s from publication of a frame to that of the result;
+    ``lost`` frames; by node, ``processor`` ms per cycle, and ``memory`` (samples,) MiB."""
+
+    rate: float
+    latency: np.ndarray
+    lost: int
+    processor: Mapping[str, float]
+    memory: Mapping[str, np.ndarray]
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """For a row."""
+        busy = {f"{name} ms": round(ms, 2) for name, ms in self.processor.items()}
+        return {"cycles": len(self.latency), "lost": self.lost, "processor time per cycle": busy}
+
+    def percentile(self, percent: float) -> float:
+        """Of the latency, ms."""
+        return float(np.percentile(self.latency, percent)) * 1e3
+
+
+def four_processes(material: Material) -> list[Row]:
+    """Highest rate without loss, then latency at the drive's rate or what can be sustained."""
+    bare = _bare(material, 0.0)
+    chain = _chain(material, 0.0)
+    rate = min(DRIVE, 0.9 * chain.rate)
+    paced_bare, paced = _bare(material, rate), _chain(material, rate)
+    return [
+        Row("four processes over DDS", chain.rate, "/s", "a subscriber that does nothing", bare.rate,
+            min(chain.rate, DRIVE) / min(bare.rate, DRIVE) if not chain.lost else 0.0, 0.8,
+            note="figure: both limited to 90/s; 0 where a frame was lost", details=chain.details),
+        *_latencies(f"latency at {rate:.0f}/s, four processes", paced, paced_bare, 8.0, 11.0),
+    ]  # fmt: skip
+
+
+def one_process(material: Material) -> list[Row]:
+    """The pipeline node: highest rate, then latency at the drive's rate or what can be sustained."""
+    free = _chain(material, 0.0, arrangement="pipeline")
+    rate = min(DRIVE, 0.9 * free.rate)
+    paced = _chain(material, rate, arrangement="pipeline")
+    tracked = _chain(material, rate, arrangement="pipeline", tracking=True)
+    return [
+        Row("pipeline", free.rate, "/s", "the drive", DRIVE, free.rate, DRIVE, details=free.details),
+        *_latencies(f"latency at {rate:.0f}/s, pipeline", paced, None, 6.0, 9.0),
+        *_latencies(f"latency at {rate:.0f}/s, pipeline, tracking", tracked, None, 6.0, 9.0),
+    ]  # fmt: skip
+
+
+def recorder(material: Material) -> list[Row]:
+    """What a recorder beside the chain takes of its rate, and what it writes when frames are recorded too."""
+    without = _chain(material, 0.0)
+    beside = _chain(material, 0.0, output=material.directory / "recorded")
+    output = material.directory / "recorded_frames"
+    frames = _chain(material, 0.0, output=output, images=True)
+    size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
+    cycles = len(frames.latency) + WARM_UP
+    megabytes = size / 1e6 / cycles * frames.rate
+    disk = _disk_rate(material.directory, size_mb=400 if material.quick else 2000)
+    return [
+        Row("recorder beside: poses and localizations", beside.rate, "/s", "without", without.rate,
+            beside.rate / without.rate, 0.97, details=beside.details),
+        Row("recorder beside: frames too", megabytes, "MB/s", "the disk, sequential", disk,
+            details={**frames.details, "cycles/s": frames.rate}),
+    ]  # fmt: skip
+
+
+def endurance(material: Material) -> list[Row]:
+    """Growth of each node's memory, over the second half of the cycles."""
+    series = _chain(material, 0.0, cycles=600 if material.quick else 10_000)
+    rows = []
+    for name, samples in series.memory.items():
+        half = samples[len(samples) // 2 :]
+        cycles = len(series.latency) / 2
+        growth = float(np.polyfit(np.linspace(0, cycles, len(half)), half, 1)[0]) * 1e4
+        rows.append(
+            Row(f"memory of {name}", float(half.mean()), "MiB", "flat", None, growth, None,
+                50.0, note="figure: MiB per 10 000 cycles")
+        )  # fmt: skip
+    return rows
+
+
+def _latencies(name: str, series: Series, bare: Series | None, median: float, worst: float) -> list[Row]:
+    """Median and 99 %, beyond the bare transport where there is one."""
+    rows = []
+    for label, percent, limit in ((", median", 50, median), (", 99 %", 99, worst)):
+        measured = series.percentile(percent)
+        base = None if bare is None else bare.percentile(percent)
+        rows.append(
+            Row(name + label, measured, "ms", "bare transport" if bare else "", base,
+                measured - (base or 0.0), None, limit, details=series.details if percent == 50 else {})
+        )  # fmt: skip
+    return rows
+
+
+# Arrangements --------------------------------------------------------------------------------------
+
+
+def _source(material: Material, rate: float, acknowledged_by: str) -> Any:
+    from mems6dof_ros.nodes.system import NodeSpec
+
+    pacing = (
+        {"pacing": "rate", "rate": rate}
+        if rate
+        else {"pacing": "consumer", "acknowledged_by": acknowledged_by}
+    )
+    settings = {"width_px": material.size, "height_px": material.size, **material.simulation}
+    simulation = {f"simulator.{name}": value for name, value in settings.items()}
+    return NodeSpec("frame_source", {"source": "simulator", "simulator.loop": CYCLES, **pacing, **simulation})
+
+
+def _duration(material: Material) -> float:
+    return 8.0 if material.quick else 60.0
+
+
+def _bare(material: Material, rate: float) -> Series:
+    from mems6dof_ros.nodes.system import run_system
+
+    source = _source(material, rate, topics.LOCALIZATIONS)
+    waiting = {**source.parameters, "wait_for_subscribers": [f"{topics.IMAGE}:1"]}
+    namespace = f"bench_{os.getpid()}"
+    nodes = [replace(source, parameters=waiting)]
+    with (
+        _listening(topics.LOCALIZATIONS, namespace) as (received, spin),
+        run_system(nodes, namespace=namespace, on_line=_quiet) as running,
+        ExitStack() as stack,
+    ):
+        environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        command = [
+            sys.executable,
+            "-m",
+            "mems6dof_ros.bench.listener",
+            "--ros-args",
+            "-r",
+            f"__ns:=/{namespace}",
+        ]
+        listener = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+        stack.callback(_end, listener)
+        processes = {**{name: p.pid for name, p in running.processes.items()}, "listener": listener.pid}
+        return _measure(received, spin, running.poll, processes, topics.LOCALIZATIONS, _duration(material))
+
+
+def _chain(
+    material: Material,
+    rate: float,
+    *,
+    arrangement: str = "processes",
+    tracking: bool = False,
+    output: Path | None = None,
+    images: bool = False,
+    cycles: int = 0,
+) -> Series:
+    from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
+    from mems6dof_ros.nodes.system import chain, run_system
+
+    nodes = chain(
+        _source(material, rate, topics.POSE_6DOF),
+        calibration=str(material.calibration_path),
+        output=str(output) if output else "",
+        recorded=[*DEFAULT_TOPICS, topics.IMAGE] if images else DEFAULT_TOPICS,
+        watched={topics.POSE_6DOF: "bench"},
+        arrangement=arrangement,
+    )
+    nodes = [
+        replace(node, parameters={**node.parameters, "tracking.enabled": True})
+        if tracking and node.executable in ("localizer", "pipeline")
+        else node
+        for node in nodes
+    ]
+    namespace = f"bench_{os.getpid()}"
+    with (
+        _listening(topics.POSE_6DOF, namespace) as (received, spin),
+        run_system(nodes, namespace=namespace, on_line=_quiet) as running,
+    ):
+        processes = {name: process.pid for name, process in running.processes.items()}
+        duration = 0.0 if cycles else _duration(material)
+        return _measure(received, spin, running.poll, processes, topics.POSE_6DOF, duration, cycles)
+
+
+def _quiet(line: str) -> None:
+    """Nobody reads what the nodes say, but for what is wrong."""
+    if "ERROR" in line or "error:" in line:
+        print(line, file=sys.stderr)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    process.wait(timeout=10)
+
+
+# Measuring -----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _listening(
+    topic: str, namespace: str
+) -> Iterator[tuple[list[tuple[float, Any]], Callable[[float], None]]]:
+    """Serialized messages of ``topic`` with the monotonic time of their arrival, while ``spin`` runs."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from mems6dof_msgs.msg import Localizations, Pose6DOF
+    from mems6dof_ros.nodes import transport
+
+    received: list[tuple[float, Any]] = []
+    os.environ.update(transport.LOCALHOST_ONLY)
+    transport.use_profile(frames=False)
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node("bench", namespace=namespace)
+        kind = Pose6DOF if topic == topics.POSE_6DOF else Localizations
+        node.create_subscription(
+            kind, topic, lambda data: received.append((time.monotonic(), data)), transport.MESSAGES, raw=True
+        )
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        yield received, lambda seconds: executor.spin_once(timeout_sec=seconds)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _measure(
+    received: list[tuple[float, Any]],
+    spin: Callable[[float], None],
+    poll: Callable[[], Mapping[str, int]],
+    processes: Mapping[str, int],
+    topic: str,
+    duration: float,
+    cycles: int = 0,
+) -> Series:
+    """After WARM_UP messages, those of ``duration`` s or so many ``cycles``."""
+
+    def wait(done: Callable[[], bool], limit: float) -> None:
+        deadline = time.monotonic() + limit
+        while not done():
+            spin(0.1)
+            if codes := poll():
+                raise Mems6dofError(f"nodes ended while they were measured: {dict(codes)}")
+            if time.monotonic() > deadline:
+                raise Mems6dofError(f"no {topic} for {limit:g} s: {len(received)} so far")
+
+    wait(lambda: len(received) >= WARM_UP, START)
+    begin, first = time.monotonic(), len(received)
+    before = {name: _processor_seconds(pid) for name, pid in processes.items()}
+    memory: dict[str, list[float]] = {name: [] for name in processes}
+    sampled = begin - 1.0
+
+    def done() -> bool:
+        nonlocal sampled
+        if time.monotonic() - sampled > 0.5:
+            sampled = time.monotonic()
+            for name, pid in processes.items():
+                memory[name].append(_memory(pid))
+        return len(received) - first >= cycles if cycles else time.monotonic() - begin >= duration
+
+    wait(done, max(60.0 + duration, cycles / 2))
+    after = {name: _processor_seconds(pid) for name, pid in processes.items()}
+    chosen = received[first:]
+    latency, counters = zip(*(_read(data, topic) for _, data in chosen), strict=True)
+    return Series(
+        rate=(len(chosen) - 1) / (chosen[-1][0] - chosen[0][0]),
+        latency=np.array(latency),
+        lost=counters[-1] - counters[0] + 1 - len(counters),
+        processor={name: (after[name] - before[name]) / len(chosen) * 1e3 for name in processes},
+        memory={name: np.array(samples) for name, samples in memory.items()},
+    )
+
+
+def _read(data: bytes, topic: str) -> tuple[float, int]:
+    """Latency, s, and frame counter of a serialized result."""
+    if topic == topics.POSE_6DOF:
+        pose = messages.deserialize(data, "mems6dof_msgs/msg/Pose6DOF")
+        return float(pose.latency_total), int(pose.frame_counter)
+    found = messages.deserialize(data, "mems6dof_msgs/msg/Localizations")
+    spent = messages.nanoseconds(found.publication_time) - messages.nanoseconds(found.frame_publication_time)
+    return spent * 1e-9, int(found.frame_counter)
+
+
+def _processor_seconds(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _memory(pid: int) -> float:
+    """Resident memory, MiB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def _disk_rate(directory: Path, size_mb: int) -> float:
+    """MB/s of writing frames one after another, until they are on the disk."""
+    block = np.random.default_rng(0).integers(0, 255, 8_388_608, dtype=np.uint8).tobytes()
+    path = directory / "disk"
+    begin = time.monotonic()
+    with path.open("wb") as stream:
+        written: Sequence[int] = [stream.write(block) for _ in range(max(size_mb * 10**6 // len(block), 1))]
+        stream.flush()
+        os.fsync(stream.fileno())
+    seconds = time.monotonic() - begin
+    path.unlink()
+    return sum(written) / 1e6 / seconds

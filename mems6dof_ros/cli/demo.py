@@ -83,10 +83,7 @@ def run(args: argparse.Namespace) -> int:
     if args.cycles < 2:
         raise InputError("--cycles", f"{args.cycles}", "2 or more, 80 for a revolution")
     started = time.monotonic()
-    _prepare(args.out)
-    calibration = args.out / "optics.yaml"
-    _say("1/3  calibrate: bead substrate through focus, in two orientations")
-    _calibrate(settings, calibration)
+    calibration = prepare(settings, args.out)
     if args.closed_loop:
         _say("2/3  close the loop: the four nodes and a controller as five processes")
         passed = run_closed_loop(args.out, calibration=calibration, settings=settings) == 0
@@ -99,9 +96,7 @@ def run(args: argparse.Namespace) -> int:
 def _turn(settings: SimulationSettings, cycles: int, calibration: Path, out: Path) -> bool:
     from mems6dof_ros.analysis.report import write_report
 
-    bag = out / "bag"
-    _say("2/3  measure: frame_source, localizer, pose_estimator and recorder as four processes")
-    _measure(settings, cycles, calibration, bag, out / "nodes.log")
+    bag = measure(settings, cycles, calibration, out)
     _say("3/3  report")
     page = write_report(bag, out / "report")
     passed = _print_result(bag, cycles)
@@ -113,14 +108,19 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _prepare(out: Path) -> None:
-    """An empty directory, in place of an earlier demonstration but of nothing else."""
+def prepare(settings: SimulationSettings, out: Path) -> Path:
+    """Make ``out``, in place of an earlier demonstration but of nothing else, and calibrate the optics of
+    ``settings``; returns the calibration file. Raises InputError where ``out`` holds something else."""
     if out.exists() and not (out / MARKER).exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), "something else than an earlier demonstration", "a new directory: --out")
     if (out / MARKER).exists():
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
     (out / MARKER).touch()
+    _say("1/3  calibrate: bead substrate through focus, in two orientations")
+    path = out / "optics.yaml"
+    _calibrate(settings, path)
+    return path
 
 
 def _calibrate(settings: SimulationSettings, path: Path) -> None:
@@ -136,14 +136,17 @@ def _calibrate(settings: SimulationSettings, path: Path) -> None:
     )
 
 
-def _measure(settings: SimulationSettings, cycles: int, calibration: Path, bag: Path, log: Path) -> None:
-    """Run the nodes until every frame has become a pose; raises Mems6dofError where a node fails."""
+def measure(settings: SimulationSettings, cycles: int, calibration: Path, out: Path) -> Path:
+    """Run the nodes until every frame has become a pose; returns the bag. Raises Mems6dofError where a node
+    fails."""
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
     from mems6dof_ros.nodes.system import NodeSpec, chain, run_system, simulated
     from mems6dof_ros.nodes.watch import watch_poses
     from mems6dof_ros.recording import topics
 
+    _say("2/3  measure: frame_source, localizer, pose_estimator and recorder as four processes")
+    bag, log = out / "bag", out / "nodes.log"
     source = simulated(cycles, **settings.to_dict())
     nodes = chain(
         source,
@@ -171,6 +174,7 @@ def _measure(settings: SimulationSettings, cycles: int, calibration: Path, bag: 
     if failed := {name: code for name, code in codes.items() if code}:
         tail = "\n".join(log.read_text(encoding="utf-8").splitlines()[-5:])
         raise Mems6dofError(f"nodes failed: {failed}; see {log}, which ends:\n{tail}")
+    return bag
 
 
 def describe(pose: CyclePose) -> str:

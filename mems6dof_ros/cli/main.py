@@ -25,6 +25,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "cameras": "mems6dof_ros.cli.cameras",
     "bench": "mems6dof_ros.cli.bench",
     "validate": {
+        "stream": "mems6dof_ros.cli.validate_stream",
         "localization": "mems6dof_ros.cli.validate_localization",
         "calibration": "mems6dof_ros.cli.validate_calibration",
         "pose": "mems6dof_ros.cli.validate_pose",

@@ -93,7 +93,7 @@ def figures(
 ) -> list[Figure]:
     """All figures; ``count`` matched particles. Deterministic for a seed, but for the speeds."""
     parts: Sequence[Callable[[], list[Figure]]] = (
-        lambda: _matched(count, seed),
+        lambda: matched_fits(count, seed),
         lambda: _weightings(count, seed),
         lambda: _brightness(max(count // 50, 20), seed),
         lambda: _honesty(max(count // 20, 50), seed),
@@ -124,7 +124,7 @@ def _errors(fits: GaussianFits, truth: Array) -> tuple[Array, Array]:
     return (fits.parameters - truth)[good], np.sqrt(variance.mean(axis=0))
 
 
-def _matched(count: int, seed: int) -> list[Figure]:
+def matched_fits(count: int, seed: int) -> list[Figure]:
     """Gaussian truth, 21 px, 20 000 electrons, background 20."""
     table = []
     image, truth, camera = matched_field(count, seed)

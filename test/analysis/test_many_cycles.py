@@ -120,8 +120,8 @@ def test_uncertainty_of_what_turns_knows_that_play_remembers():
 
 
 def test_two_bodies_turn_by_their_ratio():
-    """Squared errors of the differences as claimed: 1, the mean of 360 values; those by the map, up to half of
-    the variance in the first cycles, are common to many cycles."""
+    """Squared errors of the differences as claimed: 1, the mean of 360 values, of which the map's, up to half
+    of the variance in the first cycles, are common to many."""
     scenes = [
         Scene(200, 60e-6, motion=GearMotion(step=step, step_sd=0.0, centre=(x, 0.0)))
         for step, x in ((math.radians(4.5), -65e-6), (math.radians(-1.8), 65e-6))

@@ -93,8 +93,8 @@ def chain(
     ``monitor`` if any. ``arrangement`` pipeline: the first three in one process.
 
     ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for the
-    subscribers that the table gives it, and for those in ``watched`` (topic to the name of a node that is not in
-    the table), so that nothing is lost at the beginning. Nobody waits for a monitor.
+    subscribers that the table gives it, and for those in ``watched`` (topic to the name of a node that is
+    not in the table), so that nothing is lost at the beginning. Nobody waits for a monitor.
     """
     queue = {"queue_policy": queue_policy}
     remap = {topics.IMAGE: image_topic} if image_topic != topics.IMAGE else {}

@@ -78,7 +78,7 @@ def degrees_of_freedom(poses: Sequence[CyclePose], comparison: TruthComparison |
         if name == "psi":
             uniform, step = _uniform_rotation(poses)
             value, truth = value - uniform, truth - uniform
-            symbol = f"{symbol} less {number(step * scale, 5)} mrad/cycle"
+            symbol = f"{symbol} less {number(step * scale, 4)} mrad/cycle"
         if np.isfinite(truth).any():
             axis.plot(cycle, truth * scale, color=BLACK, lw=0.8, label="truth")
         else:
@@ -86,7 +86,7 @@ def degrees_of_freedom(poses: Sequence[CyclePose], comparison: TruthComparison |
         size = float(np.clip(40 / math.sqrt(len(poses)), 1.5, 4))
         bars = {"fmt": "o", "color": BLUE, "ms": size, "ecolor": BLUE, "elinewidth": 0.9, "zorder": 3}
         axis.errorbar(cycle, value * scale, 2 * spread[:, i] * scale, label="measured ± 2 sd", **bars)
-        axis.set_title(f"{symbol}    {precision}")
+        axis.set_title(f"{symbol}   {precision}")
         axis.set_ylabel(unit)
         _mark(axis, poses)
     for row in axes[-1]:

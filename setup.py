@@ -13,13 +13,14 @@ setup(
     name=NAME,
     version=VERSION,
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["**/*.html", "**/*.xml", "**/*.css", "**/*.js", "**/*.svg", "**/*.json"]},
+    package_data={NAME: [f"**/*.{kind}" for kind in ("html", "xml", "css", "js", "svg", "json", "LICENSE")]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", sorted(glob("launch_scripts/*.launch.py"))),
         (f"share/{NAME}/config", sorted(glob("config/*"))),
         (f"share/{NAME}/bags", sorted(path for path in glob("bags/*") if Path(path).is_file())),
+        (f"share/{NAME}/bags/sample", sorted(glob("bags/sample/*"))),
     ],
     install_requires=["setuptools"],  # the rest: package.xml for rosdep, requirements/ for pip
     python_requires=">=3.10",

@@ -17,8 +17,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "bench",
         help="speed of the instrument beside its peers and limits",
-        description="Measure the speed of every part and of the whole, each beside its peer or its limit in the"
-        " same run, on simulated frames of 2048 x 2048 px with 100 particles. The exit status is 1 when a"
+        description="Measure the speed of every part and of the whole, each beside its peer or its limit in"
+        " the same run, on simulated frames of 2048 x 2048 px with 100 particles. The exit status is 1 when a"
         " figure misses its requirement. Ratios hold on a busy machine; rates and latencies need a quiet one."
         f" Rows: {', '.join(suite.ROWS)}.",
     )

@@ -58,7 +58,11 @@ def micrographs() -> list[Frame]:
         ("frame_source", ["source:=bag"], "parameter bag.path: found no path"),
         ("frame_source", ["source:=images", "images.path:=absent.tif"], "absent.tif: found nothing there"),
         ("frame_source", ["simulator.clumps:=500"], "clumps: found 500; expected fewer"),
-        ("frame_source", ["wait_for_subscribers:=[image_raw]"], "found 'image_raw'; expected topic:node or topic:number"),
+        (
+            "frame_source",
+            ["wait_for_subscribers:=[image_raw]"],
+            "found 'image_raw'; expected topic:node or topic:number",
+        ),
         ("localizer", ["calibration:=absent.yaml"], "absent.yaml: found"),
         ("localizer", [], "found neither a value nor a calibration"),
         ("localizer", ["detection.threshold:=.nan"], "detection.threshold: found nan; expected finite"),

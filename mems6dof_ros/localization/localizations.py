@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntFlag
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,7 @@ class GaussianFits:
     def __len__(self) -> int:
         return len(self.parameters)
 
-    @property
+    @cached_property
     def flux(self) -> NDArray[np.float64]:
         """Electrons in each Gaussian, 2 pi A sigma_x sigma_y sqrt(1 - rho^2), (n,)."""
         _, _, amplitude, sigma_x, sigma_y, rho, _ = self.parameters.T

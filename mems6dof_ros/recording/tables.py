@@ -117,12 +117,15 @@ CYCLES = Table(
 )
 
 
+_UPPER = np.triu_indices(3)
+
+
 def _sighting_row(sighting: Sighting) -> list[Any]:
     found, i = sighting.found, sighting.index
     return [
         *(found.cycle, found.frame_counter, found.stamp_ns, i),
         *found.position[i],
-        *found.covariance[i][np.triu_indices(3)],
+        *found.covariance[i][_UPPER],
         *found.fits.parameters[i],
         *(found.fits.flux[i], found.fits.chi_square[i], found.z_gap[i]),
         *(found.flags[i], sighting.body, sighting.particle_id),

@@ -168,7 +168,7 @@ def scaling(material: Material) -> list[Row]:
     counts = (10, 100, 400) if material.quick else (10, 50, 100, 200, 400)
     sizes = (512, 1024, 2048) if material.quick else (512, 1024, 2048, 4096)
     by_count = [_cost(material, count, 2048) for count in counts]
-    by_size = [_cost(material, 100, size) for size in sizes]
+    by_size = [_cost(material, 20, size) for size in sizes]  # few, so that 512 px hold them
     return [
         _slope("cost against particles", [n for n, _ in by_count], [t for _, t in by_count], "particle"),
         _slope("cost against the field", [size**2 / 1e6 for size in sizes], [t for _, t in by_size], "Mpx"),

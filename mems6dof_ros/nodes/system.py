@@ -178,26 +178,13 @@ def _live(values: Mapping[str, str]) -> list[NodeSpec]:
     if values["source"] != "none":
         parameters = {"source": values["source"], "pacing": "rate", "rate": float(values["rate"])}
         source = NodeSpec("frame_source", parameters)
-    return chain(
-        source,
-        calibration=values["calibration"],
-        output=values["output"],
-        queue_policy="drop_oldest",
-        image_topic=values["image_topic"],
-        monitor=_monitor(values),
-        arrangement=values["arrangement"],
-    )
+    image_topic = values["image_topic"]
+    return chain(source, queue_policy="drop_oldest", image_topic=image_topic, **_common(values))
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
     source = replayed(values["bag"], values["topic"])
-    return chain(
-        source,
-        calibration=values["calibration"],
-        output=values["output"],
-        monitor=_monitor(values),
-        arrangement=values["arrangement"],
-    )
+    return chain(source, **_common(values))
 
 
 def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -209,13 +196,7 @@ def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
         seed=int(values["seed"]),
         optics_seed=int(values["optics_seed"]),
     )
-    return chain(
-        source,
-        calibration=values["calibration"],
-        output=values["output"],
-        monitor=_monitor(values),
-        arrangement=values["arrangement"],
-    )
+    return chain(source, **_common(values))
 
 
 def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -224,14 +205,17 @@ def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
         width_px=size, height_px=size, seed=int(values["seed"]), optics_seed=int(values["optics_seed"])
     )
     controller = NodeSpec("controller", {"law": values["law"]})
-    return chain(
-        source,
-        calibration=values["calibration"],
-        output=values["output"],
-        controller=controller,
-        monitor=_monitor(values),
-        arrangement=values["arrangement"],
-    )
+    return chain(source, controller=controller, **_common(values))
+
+
+def _common(values: Mapping[str, str]) -> dict[str, Any]:
+    """What ``chain`` is told by the arguments that every system has."""
+    return {
+        "calibration": values["calibration"],
+        "output": values["output"],
+        "monitor": _monitor(values),
+        "arrangement": values["arrangement"],
+    }
 
 
 def _monitor(values: Mapping[str, str]) -> NodeSpec | None:

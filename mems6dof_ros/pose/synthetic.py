@@ -167,14 +167,3 @@ def merged(views: Sequence[Localizations], seed: int) -> tuple[Localizations, ND
     position = np.concatenate([view.position for view in views])[order]
     variance = np.concatenate([np.diagonal(view.covariance, axis1=1, axis2=2) for view in views])[order]
     return make_localizations(position, variance, views[0].cycle), order
-
-
-def warm_up() -> None:
-    """Run every compiled kernel of the pose once, so that no first frame waits for the compiler: most of a
-    minute where nothing is cached yet, a second afterwards."""
-    from mems6dof_ros.pose.estimator import PoseEstimator
-
-    gear, estimator = SyntheticGear(Scene(particles=40), 1), PoseEstimator()
-    for step in (0.1, 2.0, 0.1):  # two radians: beyond any prediction, for the global match
-        estimator.update(gear.observe()[0])
-        gear.advance(step)

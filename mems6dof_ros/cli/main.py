@@ -31,6 +31,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
         "pose": "mems6dof_ros.cli.validate_pose",
         "cameras": "mems6dof_ros.cli.validate_cameras",
         "control": "mems6dof_ros.cli.validate_control",
+        "lab": "mems6dof_ros.cli.validate_lab",
     },
 }
 

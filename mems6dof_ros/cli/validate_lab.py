@@ -9,9 +9,9 @@ from pathlib import Path
 
 from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
 
-#: Part to the module that measures it. Each has ``figures(work: Path, seed: int, tell: Callable[[str], None])``,
-#: which works in the directory ``work``, tells what it is doing, and yields rows: quantity, measured, required
-#: (text), passed (None: for information).
+#: Part to the module that measures it by ``figures(work: Path, seed: int, tell: Callable[[str], None])``: it
+#: works in the directory ``work``, tells what it is doing, and yields rows of quantity, measured, required
+#: (text) and passed (None: for information).
 PARTS = {
     "messages": "mems6dof_ros.nodes.hostile",
 }

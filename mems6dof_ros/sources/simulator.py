@@ -1,4 +1,5 @@
-"""Frames from the physical simulator, of a gear that turns by itself or under command."""
+"""Frames from the physical simulator: of a gear that turns by itself or under command, or of a substrate of
+beads under a moving stage."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from mems6dof_ros.control.actuator import Actuator
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
-from mems6dof_ros.simulation.experiment import Experiment, motion_frames
+from mems6dof_ros.simulation.experiment import BeadSubstrate, Experiment, motion_frames
 from mems6dof_ros.simulation.experiment import loop as repeat
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.source import SourceInfo
@@ -58,14 +59,26 @@ class SimulatorSource:
         self._frames = iter(())
 
 
-def open_simulator(*, commanded: bool = False, **options: Any) -> SimulatorSource | CommandedSimulator:
-    """The source "simulator": SimulatorSource or, ``commanded``, CommandedSimulator."""
-    if not commanded:
+def open_simulator(
+    *,
+    commanded: bool = False,
+    substrate: bool = False,
+    substrate_beads: int = 200,
+    substrate_rotation: float = 0.0,
+    **options: Any,
+) -> SimulatorSource | CommandedSimulator | SubstrateSimulator:
+    """The source "simulator": SimulatorSource, ``commanded`` CommandedSimulator, or ``substrate``
+    SubstrateSimulator."""
+    if not (commanded or substrate):
         return SimulatorSource(**options)
+    if commanded and substrate:
+        raise InputError("simulator", "both commanded and substrate", "one of them")
     for name in ("cycles", "loop"):
         if options.pop(name, 0):
-            raise InputError(name, "a number of cycles", "0 of a simulator that is commanded")
-    return CommandedSimulator(**options)
+            raise InputError(name, "a number of cycles", "0 with commanded or substrate")
+    if commanded:
+        return CommandedSimulator(**options)
+    return SubstrateSimulator(beads=substrate_beads, rotation=substrate_rotation, **options)
 
 
 class CommandedSimulator:
@@ -102,6 +115,37 @@ class CommandedSimulator:
 
     def stop(self) -> None:
         self.actuator.enable(False)
+
+
+class SubstrateSimulator:
+    """Beads on a plane substrate, and the stage that moves the focal plane: a Stage and a FrameSource.
+
+    A frame for each ``read``, live, of wherever ``move_to`` has brought the focal plane; 0 at the start.
+    ``beads``, ``rotation`` rad: see BeadSubstrate. ``settings`` are those of SimulationSettings.
+    """
+
+    def __init__(self, *, beads: int = 200, rotation: float = 0.0, **settings: Any) -> None:
+        self.settings = SimulationSettings.from_dict(settings)
+        self._substrate = BeadSubstrate(self.settings, beads=beads, rotation=rotation)
+        self._position = self.settings.stage_z
+
+    @property
+    def info(self) -> SourceInfo:
+        return replace(SimulatorSource(**self.settings.to_dict()).info, kind="simulated substrate of beads")
+
+    def move_to(self, z: float) -> float:
+        self._position = z
+        return z
+
+    def start(self) -> None:
+        pass
+
+    def read(self, timeout: float | None = None) -> Frame | None:
+        middle_ns = time.time_ns() + round(self.settings.exposure * 1e9) // 2
+        return replace(self._substrate.frame(self._position), stamp_ns=middle_ns, live=True)
+
+    def stop(self) -> None:
+        pass
 
 
 def camera_noise(settings: SimulationSettings) -> CameraNoise:

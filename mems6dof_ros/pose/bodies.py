@@ -11,16 +11,23 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.pose.field import FieldError
 from mems6dof_ros.pose.rigid import RigidPose, hat
+from mems6dof_ros.pose.usable import usable
 
 Array = NDArray[np.float64]
+
+#: Settings that bodies in one field have in common, because they see it through the same optics.
+COMMON_SETTINGS = ("reference", "field_size", "field_degree", "field_sd_xy", "field_sd_z")
 
 
 class Bodies:
     """One PoseEstimator per body; a localization that one body claims is not offered to the next.
 
-    Raises InputError where a body cannot be told from the others: with several, each needs a region or
-    a reference constellation, and a name of its own.
+    They are seen through the same optics, so they share one estimate of the field error, as good as that of
+    one body with all the particles. Raises InputError where a body cannot be told from the others (with
+    several, each needs a region or a reference constellation, and a name of its own) and where their
+    COMMON_SETTINGS differ.
     """
 
     def __init__(self, estimators: Sequence[PoseEstimator]) -> None:
@@ -30,10 +37,14 @@ class Bodies:
         for estimator in estimators:
             if len(names) > 1 and estimator.region is None and estimator.reference is None:
                 raise InputError(f"body {estimator.body}", "neither", "a region or a reference constellation")
+        for name in COMMON_SETTINGS:
+            if len(values := {getattr(estimator.settings, name) for estimator in estimators}) > 1:
+                raise InputError(f"bodies: {name}", str(values), "the same for all: they share one field")
         self.estimators = tuple(estimators)
 
     def update(self, localizations: Localizations) -> list[CyclePose]:
         """Poses of this cycle, in the order of the bodies."""
+        self._share_field(localizations)
         available = np.ones(len(localizations), bool)
         poses = []
         for estimator in self.estimators:
@@ -46,6 +57,17 @@ class Bodies:
         """Forget everything measured of all bodies."""
         for estimator in self.estimators:
             estimator.reset()
+
+    def _share_field(self, localizations: Localizations) -> None:
+        """One field error for all, over the field as all their particles show it."""
+        settings = self.estimators[0].settings
+        if self.estimators[0].field is not None:
+            return
+        seen = usable(localizations).position[:, :2]
+        if len(seen) >= settings.min_particles:
+            field = FieldError.assumed(settings, np.abs(seen).max(axis=0))
+            for estimator in self.estimators:
+                estimator.field = field
 
 
 def relative_pose(of: CyclePose, to: CyclePose) -> tuple[RigidPose, Array]:

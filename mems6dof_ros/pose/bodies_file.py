@@ -1,19 +1,22 @@
-"""Which rigid bodies a recording shows: a YAML file to one PoseEstimator for each.
+"""Which rigid bodies are in view: a YAML file to one PoseEstimator for each.
 
 ```yaml
+settings: {field_degree: 4}                                       # fields of PoseSettings, for all
 bodies:
   load_gear:
     region: {centre: [-100.0e-6, 0], outer_radius: 170.0e-6}      # m, microscope frame
   ring_gear:
     region: {centre: [474.0e-6, 0], outer_radius: 420.0e-6, inner_radius: 300.0e-6}
     constellation: ring_gear_constellation.json                   # of an earlier session; beside this file
-    settings: {field_degree: 0}                                   # fields of PoseSettings
+    settings: {confirm_after: 2}                                  # of this body alone
 ```
+
+Settings of the field error are common to all bodies, because their optics are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,7 @@ from typing import Any
 import yaml
 
 from mems6dof_ros.errors import InputError
-from mems6dof_ros.pose.bodies import Bodies
+from mems6dof_ros.pose.bodies import COMMON_SETTINGS, Bodies
 from mems6dof_ros.pose.constellation_file import ReferenceConstellation
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.pose.settings import PoseSettings, Region
@@ -40,25 +43,26 @@ def load_bodies(path: Path, settings: PoseSettings | None = None) -> Bodies:
         raise InputError(str(path), error.strerror or "an unreadable file", "a file of bodies") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(str(path), "no valid YAML", "a file of bodies") from error
-    bodies = _mapping(content, str(path), ("bodies",)).get("bodies")
+    content = _mapping(content, str(path), ("settings", "bodies"))
+    names = [item.name for item in fields(PoseSettings)]
+    common = _settings(content.get("settings"), names, f"{path}: settings")
+    settings, bodies = replace(settings or PoseSettings(), **common), content.get("bodies")
     if not isinstance(bodies, dict) or not bodies:
         raise InputError(str(path), "no bodies", "'bodies:' with one entry for each")
-    return Bodies(
-        [_estimator(str(name), entry, path, settings or PoseSettings()) for name, entry in bodies.items()]
-    )
+    return Bodies([_estimator(str(name), entry, path, settings) for name, entry in bodies.items()])
 
 
 def _estimator(name: str, entry: Any, path: Path, settings: PoseSettings) -> PoseEstimator:
     where = f"{path}: body {name}"
     entry = _mapping(entry, where, _OF_A_BODY)
-    own = _mapping(entry.get("settings"), f"{where}: settings", [item.name for item in fields(PoseSettings)])
-    values = {key: _setting(key, value, f"{where}: {key}") for key, value in own.items()}
+    names = [item.name for item in fields(PoseSettings) if item.name not in COMMON_SETTINGS]
+    own = _settings(entry.get("settings"), names, where)
     region = reference = None
     if "region" in entry:
         region = _region(entry["region"], f"{where}: region")
     if "constellation" in entry:
         reference = ReferenceConstellation.load(path.parent / str(entry["constellation"]))
-    return PoseEstimator(replace(settings, **values), name, region, reference)
+    return PoseEstimator(replace(settings, **own), name, region, reference)
 
 
 def _region(entry: Any, where: str) -> Region:
@@ -69,6 +73,13 @@ def _region(entry: Any, where: str) -> Region:
     x, y = (_number(value, f"{where}: centre") for value in centre)
     radii = {key: _number(value, f"{where}: {key}") for key, value in entry.items() if key != "centre"}
     return Region((x, y), **radii)
+
+
+def _settings(entry: Any, names: Sequence[str], where: str) -> dict[str, Any]:
+    """Values for the fields ``names`` of PoseSettings."""
+    return {
+        key: _setting(key, value, f"{where}: {key}") for key, value in _mapping(entry, where, names).items()
+    }
 
 
 def _setting(name: str, value: Any, where: str) -> Any:

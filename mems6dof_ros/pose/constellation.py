@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
-from mems6dof_ros.pose.field import FieldModes
+from mems6dof_ros.pose.field import FieldError
 from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, rotation_z
 from mems6dof_ros.pose.solve import pose_jacobian
 
@@ -53,12 +53,13 @@ class Constellation:
     ``refine``. ``active`` (m,): False once retired.
     """
 
-    def __init__(self, modes: FieldModes, field_prior: Array, retire_after: int, overlap: float) -> None:
-        self.modes = modes
+    def __init__(self, field: FieldError, body: str, retire_after: int, overlap: float) -> None:
+        """``field``: shared with the other bodies in view, ``body``: who we are there."""
+        modes = field.modes
+        self.field, self.body, self.modes = field, body, modes
         self.retire_after, self.overlap = retire_after, overlap
-        self.field_mean = np.zeros(len(modes))
-        self.field_covariance = np.diag(field_prior)
-        self.field_factor = np.diag(np.sqrt(field_prior))
+        self.field_mean, self.field_covariance = field.mean, field.covariance
+        self.field_factor = field.factor
         self.ids = np.empty(0, np.int64)
         self.active = np.empty(0, bool)
         self.position = np.empty((0, 3))
@@ -71,7 +72,7 @@ class Constellation:
         self._squares = np.empty((0, 2))  # sums of squared normalised residuals, xy and z
         self._freedom = np.empty((0, 2))
         self._origin = np.empty((0, 3))  # linearisation points
-        self._information = np.diag(1 / field_prior)  # lower triangle; field first, then particles
+        self._information = np.zeros((len(modes), len(modes)))  # lower triangle; field first, then particles
         self._vector = np.zeros(len(modes))
         self._refined_at = 0
         self._latest = IDENTITY
@@ -204,21 +205,20 @@ class Constellation:
     def _solve(self) -> None:
         k, n = len(self.modes), len(self)
         information = self._information
-        scale = 1 / np.sqrt(np.diag(information))
+        scale = np.r_[np.sqrt(np.diag(self.field.prior)), 1 / np.sqrt(np.diag(information)[k:])]
         vector = self._vector * scale
         particles = information[k:, k:] * np.outer(scale[k:], scale[k:])
         cross = information[k:, :k] * np.outer(scale[k:], scale[:k])
         factor = cho_factor(particles, lower=True, overwrite_a=True, check_finite=False)
-        # Positions given the field error; then the field error itself (Schur complement).
+        # Positions given the field error; then what they leave to tell of it (Schur complement).
         gain = cho_solve(factor, np.c_[cross, vector[k:]], check_finite=False)
-        field_information = information[:k, :k] * np.outer(scale[:k], scale[:k])
-        field_information = np.tril(field_information) + np.tril(field_information, -1).T
-        field_covariance = np.linalg.inv(field_information - cross.T @ gain[:, :k])
-        field_mean = field_covariance @ (vector[:k] - cross.T @ gain[:, k])
-        correction = (gain[:, k] - gain[:, :k] @ field_mean) * scale[k:]
-        field_covariance *= np.outer(scale[:k], scale[:k])
-        self.field_factor = np.linalg.cholesky(field_covariance)
-        self.field_mean, self.field_covariance = field_mean * scale[:k], field_covariance
+        evidence = information[:k, :k] * np.outer(scale[:k], scale[:k])
+        evidence = np.tril(evidence) + np.tril(evidence, -1).T - cross.T @ gain[:, :k]
+        pull = vector[:k] - cross.T @ gain[:, k]
+        self.field.tell(self.body, evidence / np.outer(scale[:k], scale[:k]), pull / scale[:k])
+        self.field_mean, self.field_covariance = self.field.mean, self.field.covariance
+        self.field_factor = self.field.factor
+        correction = (gain[:, k] - gain[:, :k] @ (self.field_mean / scale[:k])) * scale[k:]
         self.coupling = -(gain[:, :k] * scale[k:, None] / scale[:k]).reshape(n, 3, k)
         self.position = self._origin + correction.reshape(n, 3)
         inverse, _ = dpotri(factor[0], lower=1)

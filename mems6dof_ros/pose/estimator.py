@@ -17,7 +17,7 @@ from mems6dof_ros.pose.centre import CentreOfRotation
 from mems6dof_ros.pose.constellation import Candidates, Constellation
 from mems6dof_ros.pose.constellation_file import ReferenceConstellation
 from mems6dof_ros.pose.cycle_pose import CyclePose, Status
-from mems6dof_ros.pose.field import FieldModes
+from mems6dof_ros.pose.field import FieldError
 from mems6dof_ros.pose.registration import ConstellationIndex, closest_points, log10_false_alarms
 from mems6dof_ros.pose.rigid import RigidPose, rotation_z
 from mems6dof_ros.pose.settings import PoseSettings, Region
@@ -44,8 +44,9 @@ class PoseEstimator:
     """Pose of one rigid body, cycle after cycle.
 
     ``region``: where in the field the body is; None: anywhere. ``reference``: a constellation of an earlier
-    session to start from; None: the first cycle founds one. ``constellation``, ``candidates`` and ``centre``
-    may be read at any time.
+    session to start from; None: the first cycle founds one. ``field``: what is known of the field error,
+    perhaps shared with other bodies; None: what the settings assume. ``constellation``, ``candidates`` and
+    ``centre`` may be read at any time.
     """
 
     def __init__(
@@ -54,9 +55,10 @@ class PoseEstimator:
         body: str = "load_gear",
         region: Region | None = None,
         reference: ReferenceConstellation | None = None,
+        field: FieldError | None = None,
     ) -> None:
         self.settings = settings or PoseSettings()
-        self.body, self.region, self.reference = body, region, reference
+        self.body, self.region, self.reference, self.field = body, region, reference, field
         self.reset()
 
     def reset(self) -> None:
@@ -67,6 +69,8 @@ class PoseEstimator:
 
     def _forget(self) -> None:
         self.constellation: Constellation | None = None
+        if self.field is not None:
+            self.field.forget(self.body)
         self.candidates = Candidates()
         self.centre = CentreOfRotation()
         self._index: tuple[tuple[int, int], ConstellationIndex] | None = None
@@ -184,11 +188,8 @@ class PoseEstimator:
             self._half_field = np.array(s.field_size) / 2
         else:
             self._half_field = np.abs(view.position[:, :2]).max(axis=0, initial=1e-6)
-        # A chain has no map from which the field error could be told.
-        degree = s.field_degree if s.reference == "map" else 0
-        modes = FieldModes((float(self._half_field[0]), float(self._half_field[1])), degree)
-        prior = modes.prior_variance(s.field_sd_xy, s.field_sd_z)
-        return Constellation(modes, prior, s.retire_after, s.overlap)
+        field = self.field or FieldError.assumed(s, self._half_field)
+        return Constellation(field, self.body, s.retire_after, s.overlap)
 
     # ----------------------------------------------------------------------------- tracking
 

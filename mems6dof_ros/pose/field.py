@@ -1,91 +1,57 @@
-"""Smooth errors that stand still in the field: distortion that no calibration removed.
+"""The field error as known now: smooth errors of the optics, common to all bodies in view.
 
-They are common to neighbours and to cycles, so averaging does not remove them. Here they are a linear
-combination of polynomial modes with a prior standard deviation: every solution marginalises them, and
-the rotating body, which carries each particle through many places, gradually measures them.
+They are common to neighbours and to cycles, so averaging does not remove them. They are a linear
+combination of polynomial modes with a prior covariance: every solution marginalises them, and rotating
+bodies, which carry each particle through many places, gradually measure them. Given its coefficients, bodies
+tell nothing of each other; so each tells what it has seen of them, and the sum is the exact solution.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from mems6dof_ros.calibration.field_modes import FieldModes
+from mems6dof_ros.pose.settings import PoseSettings
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class FieldModes:
-    """Modes of the error in x, y and z over a field of half-widths ``half_size`` (2,) m.
+class FieldError:
+    """Gaussian estimate of the k coefficients of ``modes``: ``mean`` (k,) m, ``covariance`` (k, k) m^2 and
+    its Cholesky ``factor``, from a ``prior`` covariance (k, k) m^2 about zero and all that was told."""
 
-    Products of Legendre polynomials up to total degree ``degree``, normalised to 1 rms over the field.
-    Left out, because no rotating body tells them from its own motion or shape: the constants, the
-    rotation in the plane, the common scale, and the two tilts of z. degree < 0: no modes.
-    """
+    def __init__(self, modes: FieldModes, prior: Array) -> None:
+        self.modes, self.prior = modes, prior
+        self._scale = np.sqrt(np.diag(prior))  # information is summed without units: its inverse is sound
+        self._become({})
 
-    half_size: tuple[float, float]
-    degree: int
+    @classmethod
+    def assumed(cls, settings: PoseSettings, half_size: Array) -> FieldError:
+        """What ``settings`` assume of the field they state, else of one of half-widths ``half_size`` (2,) m."""
+        width, height = settings.field_size or 2 * half_size
+        # A chain of micrographs has no map from which the field error could be told.
+        degree = settings.field_degree if settings.reference == "map" else 0
+        modes = FieldModes((float(width) / 2, float(height) / 2), degree)
+        return cls(modes, np.diag(modes.prior_variance(settings.field_sd_xy, settings.field_sd_z)))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Name of each mode: component and degrees in x and y."""
-        if self.degree < 1:
-            return ()
-        powers = _powers(self.degree)
-        lateral = [f"{axis}:{a}{b}" for a, b in powers if a + b >= 2 for axis in "xy"]
-        return ("stretch", "shear", *lateral, *(f"z:{a}{b}" for a, b in powers if a + b >= 2))
+    def tell(self, body: str, information: Array, vector: Array) -> None:
+        """The evidence of ``body`` so far, its particles and poses eliminated: ``information`` (k, k) m^-2,
+        ``vector`` (k,) m^-1, in place of what it told before. Raises LinAlgError, and changes nothing, where
+        numbers cannot hold the sum."""
+        scaled = information * np.outer(self._scale, self._scale), vector * self._scale
+        self._become(self._told | {body: scaled})
 
-    def __len__(self) -> int:
-        return len(self.names)
+    def forget(self, body: str) -> None:
+        """Take back what ``body`` told."""
+        self._become({other: told for other, told in self._told.items() if other != body})
 
-    def prior_variance(self, sd_xy: float, sd_z: float) -> Array:
-        """Variances (m,) of the coefficients, m^2, so that the modes make an error of ``sd_xy`` in x and
-        in y and ``sd_z`` in z, rms over the field; every mode of an axis alike."""
-        lateral = sum(not name.startswith("z") for name in self.names)
-        axial = len(self) - lateral
-        return np.r_[
-            np.full(lateral, 2 * sd_xy**2 / max(lateral, 1)), np.full(axial, sd_z**2 / max(axial, 1))
-        ]
-
-    def evaluate(self, position: Array) -> Array:
-        """Modes (n, 3, m) at ``position`` (n, 3) or (n, 2) m in the microscope frame."""
-        out = np.zeros((len(position), 3, len(self)))
-        if len(self):
-            _evaluate(
-                position[:, 0] / self.half_size[0], position[:, 1] / self.half_size[1], self.degree, out
-            )
-        return out
-
-
-def _powers(degree: int) -> list[tuple[int, int]]:
-    return [(total - b, b) for total in range(degree + 1) for b in range(total + 1)]
-
-
-@njit(cache=True, nogil=True)
-def _evaluate(u: Array, v: Array, degree: int, out: Array) -> None:
-    px = np.empty(degree + 1)
-    py = np.empty(degree + 1)
-    for i in range(len(u)):
-        px[0] = py[0] = 1.0
-        px[1], py[1] = u[i], v[i]
-        for k in range(1, degree):  # Bonnet's recursion
-            px[k + 1] = ((2 * k + 1) * u[i] * px[k] - k * px[k - 1]) / (k + 1)
-            py[k + 1] = ((2 * k + 1) * v[i] * py[k] - k * py[k - 1]) / (k + 1)
-        root = math.sqrt(1.5)  # these two move x and y together: 1/sqrt(2) rms in each
-        out[i, 0, 0], out[i, 1, 0] = root * u[i], -root * v[i]
-        out[i, 0, 1], out[i, 1, 1] = root * v[i], root * u[i]
-        m = 2
-        for axis in range(2):
-            for total in range(2, degree + 1):
-                for b in range(total + 1):
-                    value = px[total - b] * py[b] * math.sqrt((2.0 * (total - b) + 1) * (2 * b + 1))
-                    if axis == 0:
-                        out[i, 0, m] = value
-                        out[i, 1, m + 1] = value
-                        m += 2
-                    else:
-                        out[i, 2, m] = value
-                        m += 1
+    def _become(self, told: dict[str, tuple[Array, Array]]) -> None:
+        information = np.linalg.inv(self.prior / np.outer(self._scale, self._scale))
+        vector = np.zeros(len(self.modes))
+        for more, pull in told.values():
+            information, vector = information + more, vector + pull
+        inverse = np.linalg.inv(information)
+        covariance = inverse * np.outer(self._scale, self._scale)
+        self.factor = np.linalg.cholesky(covariance)
+        self.mean, self.covariance, self._told = self._scale * (inverse @ vector), covariance, told

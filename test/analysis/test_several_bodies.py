@@ -15,12 +15,13 @@ from mems6dof_ros.recording.tables import CYCLES, read_table
 BAGS = Path(__file__).parents[2] / "bags"
 
 TWO = """
+settings: {field_degree: 2}
 bodies:
   load_gear:
     region: {centre: [-100e-6, 0], outer_radius: 170e-6}
   ring_gear:
     region: {centre: [474.0e-6, 0], outer_radius: 420e-6, inner_radius: 3.0e-4}
-    settings: {field_degree: 0, recentre_at: [0.5]}
+    settings: {confirm_after: 2, recentre_at: [0.5]}
 """
 
 
@@ -35,7 +36,9 @@ def test_regions_and_settings(tmp_path):
     assert (load.body, ring.body) == ("load_gear", "ring_gear")
     assert load.region.centre == (-100e-6, 0)
     assert ring.region.inner_radius == 300e-6
-    assert ring.settings == PoseSettings(reference="previous", field_degree=0, recentre_at=(0.5,))
+    assert ring.settings == PoseSettings(
+        reference="previous", field_degree=2, confirm_after=2, recentre_at=(0.5,)
+    )
 
 
 @pytest.mark.parametrize(
@@ -52,7 +55,8 @@ def test_regions_and_settings(tmp_path):
         ("bodies: {a: {settings: {gate: 1}}}", "unknown 'gate'"),
         ("bodies: {a: {settings: {min_particles: 1}}}", "at least 3"),
         ("bodies: {a: {settings: {gates: 1.0e-6}}}", "gates"),
-        ("bodies: {a: {settings: {field_degree: 4.5}}}", "field_degree"),
+        ("{settings: {field_degree: 4.5}, bodies: {a: }}", "field_degree"),
+        ("bodies: {a: {settings: {field_degree: 0}}}", "body a: found unknown 'field_degree'"),
         ("bodies: {a: {constellation: none.json}}", "none\\.json"),
     ],
 )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mems6dof_ros.calibration.field_modes import FieldModes
 from mems6dof_ros.pose.angles import from_swing_twist
-from mems6dof_ros.pose.field import FieldModes
 from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, log_so3
 from mems6dof_ros.pose.solve import FULL, LATERAL, UNUSED, solve_pose
 

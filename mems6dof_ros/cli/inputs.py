@@ -41,11 +41,9 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
 
 def open_input(path: Path, args: argparse.Namespace) -> FrameSource:
     """The bag, image stack or folder of images at ``path``."""
-    from mems6dof_ros.sources.source import open_source
+    from mems6dof_ros.sources.source import open_recording
 
-    if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists():
-        return open_source("bag", path=path, topic=args.topic)
-    return open_source("images", path=path, pixel_size=args.pixel_size, step=args.step)
+    return open_recording(path, args.topic, pixel_size=args.pixel_size, step=args.step)
 
 
 def camera_of(args: argparse.Namespace, info: SourceInfo, known: CameraNoise | None) -> CameraNoise:

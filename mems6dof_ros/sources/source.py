@@ -6,6 +6,7 @@ import importlib
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 from mems6dof_ros.errors import InputError
@@ -83,6 +84,14 @@ def open_source(kind: str, **options: Any) -> FrameSource:
         if needed and option not in options:
             raise InputError(f"source '{kind}'", f"no option '{option}'", "a value for it")
     return source(**options)
+
+
+def open_recording(path: Path, topic: str = "", **images: Any) -> FrameSource:
+    """The bag at ``path``, with its images on ``topic`` (empty: the only one), or the image stack or folder of
+    images, with options ``images`` of ImagesSource."""
+    if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists():
+        return open_source("bag", path=path, topic=topic)
+    return open_source("images", path=path, **images)
 
 
 def frames(source: FrameSource) -> Iterator[Frame]:

@@ -259,3 +259,45 @@ def test_a_frame_of_the_wrong_size_is_refused_and_lost():
         source.read()
     frame = source.read()
     assert (frame.frame_counter, frame.frames_dropped) == (2, 1)
+
+
+class AdjustableDevice(ScriptedDevice):
+    def adjust(self, exposure, gain):
+        if exposure > 0.01:
+            raise InputError("exposure", f"{exposure:g}", "0.0001 to 0.01")
+        known = {name: value for name, value in (("exposure", exposure), ("gain", gain)) if value == value}
+        self.state = replace(self.state, **known)
+
+
+def test_exposure_and_gain_change_while_it_runs_and_outlive_an_outage():
+    opened = []
+
+    def open_device(settings):
+        opened.append(settings)
+        return AdjustableDevice([1, 2, CameraLostError("cable")] if len(opened) == 1 else range(1, 9))
+
+    source = CameraSource("genicam", parse_settings({"gain": 3.0}), open_device)
+    source.start()
+    assert source.read().exposure_s == 0.002
+    source.adjust(exposure=0.005)
+    frame = source.read()
+    assert frame.exposure_s == source.status.exposure == 0.005
+    with pytest.raises(InputError, match=r"exposure: found 0\.05; expected 0\.0001 to 0\.01"):
+        source.adjust(exposure=0.05)
+    with pytest.raises(InputError, match="exposure: found -1"):
+        source.adjust(exposure=-1.0)
+    source.adjust(gain=6.0)
+    assert source.status.gain == 6.0
+    source.read(timeout=5.0)  # of the second opening
+    assert (opened[1].exposure, opened[1].gain, opened[1].device) == (0.005, 6.0, "scripted")
+
+
+def test_nothing_is_asked_of_a_camera_that_is_away():
+    source, _ = source_of([CameraLostError("cable")], Mems6dofError("gone"), trigger="software")
+    with pytest.raises(TimeoutError):
+        source.read(timeout=0.01)
+    assert not source.status.connected
+    with pytest.raises(CameraLostError, match="camera scripted is not there"):
+        source.trigger()
+    with pytest.raises(CameraLostError, match="camera scripted is not there"):
+        source.adjust(gain=1.0)

@@ -171,6 +171,11 @@ def test_settings_reach_the_camera_or_are_refused():
         assert [
             features.get_integer_feature_value(n) for n in ("OffsetX", "OffsetY", "GainRaw", "TestRegister")
         ] == [8, 16, 3, 7]
+        source.adjust(exposure=0.0021, gain=5.0)
+        assert source.read(timeout=5.0).exposure_s == pytest.approx(0.0021, abs=1e-6)
+        assert (features.get_float_feature_value("ExposureTimeAbs"), source.status.gain) == (2100, 5)
+        with pytest.raises(InputError, match=r"exposure: found 100; expected 1e-05 to 10"):
+            source.adjust(exposure=100.0)
         source.stop()
         for options, complaint in (
             ({"exposure": 100.0}, r"exposure: found 100; expected 1e-05 to 10"),

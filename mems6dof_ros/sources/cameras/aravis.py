@@ -15,7 +15,7 @@ from mems6dof_ros.sources.cameras.device import (
     choose_camera,
     load_driver,
 )
-from mems6dof_ros.sources.cameras.settings import CameraSettings, apply_settings
+from mems6dof_ros.sources.cameras.settings import CameraSettings, adjusted, apply_settings
 
 #: GigE Vision bootstrap register of the control channel privilege: 0 where nobody controls the camera.
 _CONTROL_PRIVILEGE = 0x0A00
@@ -114,6 +114,9 @@ class AravisDevice:
 
     def trigger(self) -> None:
         self._ask(self._camera.software_trigger)
+
+    def adjust(self, exposure: float, gain: float) -> None:
+        self._state = self._ask(adjusted, _AravisFeatures(self._device), self._state, exposure, gain)
 
     def is_alive(self) -> bool:
         try:

@@ -15,7 +15,7 @@ from mems6dof_ros.sources.cameras.device import (
     choose_camera,
     load_driver,
 )
-from mems6dof_ros.sources.cameras.settings import CameraSettings, apply_settings, parse_settings
+from mems6dof_ros.sources.cameras.settings import CameraSettings, adjusted, apply_settings, parse_settings
 
 _INSTALL = "pip install pypylon"
 
@@ -99,6 +99,10 @@ class BaslerDevice:
             wait = round(_TRIGGER_PATIENCE * 1e3)
             self._ask(lambda: self._camera.WaitForFrameTriggerReady(wait, self._pylon.TimeoutHandling_Return))
         self._ask(self._camera.ExecuteSoftwareTrigger)
+
+    def adjust(self, exposure: float, gain: float) -> None:
+        features = _PylonFeatures(self._camera.GetNodeMap())
+        self._state = self._ask(lambda: adjusted(features, self._state, exposure, gain))
 
     def is_alive(self) -> bool:
         return not self._camera.IsCameraDeviceRemoved()

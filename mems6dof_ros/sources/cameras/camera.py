@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.sources.cameras.clock import DeviceClock
 from mems6dof_ros.sources.cameras.counter import FrameCounter
-from mems6dof_ros.sources.cameras.device import CameraDevice, CameraLostError, RawFrame
+from mems6dof_ros.sources.cameras.device import CameraDevice, CameraLostError, DeviceState, RawFrame
 from mems6dof_ros.sources.cameras.pixels import decode, encoding
 from mems6dof_ros.sources.cameras.settings import CameraSettings
 from mems6dof_ros.sources.source import SourceInfo
@@ -37,7 +38,8 @@ class CameraStatus:
     one of them, or among the ``pending``: noticed as missing but not yet reported with a frame.
     ``incomplete``: frames of which packets were missing (they count as lost). ``reconnects``: times that the
     camera came back. ``clock_drift``: host's clock against the device's, minus 1. ``stamp_uncertainty`` s,
-    standard uncertainty of Frame.stamp_ns, NaN: not known yet.
+    standard uncertainty of Frame.stamp_ns, NaN: not known yet. ``exposure`` s and ``gain`` as the camera has
+    them, NaN: it does not tell.
     """
 
     name: str
@@ -49,6 +51,8 @@ class CameraStatus:
     reconnects: int
     clock_drift: float
     stamp_uncertainty: float
+    exposure: float
+    gain: float
 
 
 class CameraSource:
@@ -64,6 +68,7 @@ class CameraSource:
         self, kind: str, settings: CameraSettings, open_device: Callable[[CameraSettings], CameraDevice]
     ) -> None:
         self._kind, self._settings, self._open = kind, settings, open_device
+        self._control = threading.RLock()  # of what is asked of the device and of what it owes
         self._device: CameraDevice | None = open_device(settings)
         self._state = self._device.state
         self._running = False
@@ -88,6 +93,8 @@ class CameraSource:
             reconnects=self._reconnects,
             clock_drift=self._clock.drift,
             stamp_uncertainty=self._stamp_uncertainty(),
+            exposure=self._state.exposure,
+            gain=self._state.gain,
         )
 
     def start(self) -> None:
@@ -98,29 +105,49 @@ class CameraSource:
         self._running = True
 
     def stop(self) -> None:
-        if self._running and self._device is not None:
-            self._device.close()
-            self._device = None
-        self._running = False
+        with self._control:
+            if self._running and self._device is not None:
+                self._device.close()
+                self._device = None
+            self._running = False
 
     def trigger(self) -> None:
-        """Expose one frame now (trigger: software). Not from a thread beside ``read``."""
+        """Expose one frame now (trigger: software); from any thread. CameraLostError while it is away."""
         if self._settings.trigger != "software":
             raise InputError("trigger()", f"trigger: {self._settings.trigger}", "trigger: software")
-        if self._device is not None:
-            self._device.trigger()
+        with self._control:
+            self._here().trigger()
             self._unanswered += 1
+
+    def adjust(self, *, exposure: float = NAN, gain: float = NAN) -> None:
+        """Change the exposure, s, or the gain while it runs; from any thread. Frames state the new exposure
+        from now on, though a few may have been exposed before. InputError where the camera refuses,
+        CameraLostError while it is away."""
+        changes = {name: value for name, value in (("exposure", exposure), ("gain", gain)) if value == value}
+        with self._control:
+            settings: CameraSettings = replace(self._settings, **changes)  # type: ignore[arg-type]
+            device = self._here()
+            device.adjust(exposure, gain)
+            self._settings, self._state = settings, device.state
+
+    def _here(self) -> CameraDevice:
+        if self._device is None:
+            raise CameraLostError(f"camera {self._state.name} is not there")
+        return self._device
 
     def read(self, timeout: float | None = None) -> Frame | None:
         deadline = math.inf if timeout is None else time.monotonic() + timeout
         while self._running:
             try:
-                if self._device is None:
+                if (device := self._device) is None:
                     self._reopen(deadline)
-                elif (raw := self._device.grab(self._fire_and_wait(deadline))) is None:
-                    self._check_silence()
-                elif (frame := self._accept(raw)) is not None:
-                    return frame
+                else:
+                    raw = device.grab(self._fire_and_wait(deadline))
+                    with self._control:
+                        if raw is None:
+                            self._check_silence()
+                        elif (frame := self._accept(raw)) is not None:
+                            return frame
             except CameraLostError as error:
                 self._lose(error)
             if time.monotonic() >= deadline:
@@ -238,36 +265,38 @@ class CameraSource:
         quiet = now - self._quiet_since
         usual = (1 / self._state.frame_rate, self._state.exposure)
         patience = max(_PATIENCE, *(5 * t for t in usual if t > 0))
-        if self._device is None or now - self._check_at < patience:
+        if now - self._check_at < patience:
             return
         self._check_at = now
         self._written_off += self._unanswered
         self._unanswered = 0
-        if not self._device.is_alive():
+        if not self._here().is_alive():
             raise CameraLostError("it does not answer")
         if not self._settings.triggered and quiet > 5 * patience:
             raise CameraLostError(f"no frame for {quiet:.0f} s")
 
     def _lose(self, error: CameraLostError) -> None:
         logger.warning("camera %s lost: %s; trying to reopen it", self._state.name, error)
-        if self._device is not None:
-            self._device.close()
-            self._device = None
-        self._lost_at = self._lost_at or time.monotonic()
-        self._expect_new_device()
+        with self._control:
+            if self._device is not None:
+                self._device.close()
+                self._device = None
+            self._lost_at = self._lost_at or time.monotonic()
+            self._expect_new_device()
 
     def _reopen(self, deadline: float) -> None:
         try:
-            self._device = self._open(replace(self._settings, device=self._state.name))
+            device = self._open(replace(self._settings, device=self._state.name))
         except Mems6dofError as error:
             logger.debug("camera %s: %s", self._state.name, error)
             time.sleep(min(max(deadline - time.monotonic(), 0.0), _RETRY))
             return
-        now, before = self._device.state, self._state
-        if (now.width, now.height, now.pixel_format) != (before.width, before.height, before.pixel_format):
-            raise CameraLostError(f"reopened with {now.width} x {now.height} px of {now.pixel_format}")
-        self._state = now
-        self._device.start()
+        with self._control:
+            self._device, before, now = device, self._state, device.state
+            if _kind_of_image(now) != _kind_of_image(before):
+                raise CameraLostError(f"reopened with {now.width} x {now.height} px of {now.pixel_format}")
+            self._state = now
+            device.start()
 
     def _come_back(self, stamp_ns: int) -> int:
         """Frames that the time since the last one would have held, this one included."""
@@ -283,6 +312,10 @@ class CameraSource:
             advance - 1,
         )
         return advance
+
+
+def _kind_of_image(state: DeviceState) -> tuple[int, int, str]:
+    return state.width, state.height, state.pixel_format
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -39,7 +39,7 @@ class CameraDescription:
 
 @dataclass(frozen=True)
 class DeviceState:
-    """A camera's settings as read back: px, PFNC name, s, Hz (NaN: not known), ADU."""
+    """A camera's settings as read back: px, PFNC name, ADU, s, Hz, gain in its own unit; NaN: not known."""
 
     name: str
     width: int
@@ -48,6 +48,7 @@ class DeviceState:
     saturation_adu: int
     exposure: float = NAN
     frame_rate: float = NAN
+    gain: float = NAN
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,10 @@ class CameraDevice(Protocol):
 
     def trigger(self) -> None:
         """Expose one frame (software trigger)."""
+
+    def adjust(self, exposure: float, gain: float) -> None:
+        """Change exposure, s, and gain while it runs (NaN: leave it), and read back ``state``; InputError
+        where it refuses."""
 
     def is_alive(self) -> bool:
         """Whether the camera still answers and is still ours."""

@@ -19,7 +19,7 @@ from mems6dof_ros.sources.cameras.device import (
     choose_camera,
     load_driver,
 )
-from mems6dof_ros.sources.cameras.settings import CameraSettings, apply_settings
+from mems6dof_ros.sources.cameras.settings import CameraSettings, adjusted, apply_settings
 
 _INSTALL = "pip install harvesters"
 
@@ -83,6 +83,10 @@ class GenTLDevice:
 
     def trigger(self) -> None:
         self._ask(self._nodes.TriggerSoftware.execute)
+
+    def adjust(self, exposure: float, gain: float) -> None:
+        features = _NodeMapFeatures(self._nodes)
+        self._state = self._ask(lambda: adjusted(features, self._state, exposure, gain))
 
     def is_alive(self) -> bool:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +86,7 @@ class V4L2Device:
             self._set(cv2.CAP_PROP_FRAME_HEIGHT, settings.region[3], "region")
         if not math.isnan(settings.frame_rate):
             self._set(cv2.CAP_PROP_FPS, settings.frame_rate, "frame_rate")
-        if not math.isnan(settings.exposure):
-            self._set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL, "exposure")
-            self._set(cv2.CAP_PROP_EXPOSURE, round(settings.exposure / _EXPOSURE_UNIT), "exposure")
-        if not math.isnan(settings.gain):
-            self._set(cv2.CAP_PROP_GAIN, settings.gain, "gain")
+        self._set_exposure_and_gain(settings.exposure, settings.gain)
         self._state = DeviceState(
             name=self._path,
             width=int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
@@ -98,6 +95,7 @@ class V4L2Device:
             saturation_adu=settings.saturation_adu or full_scale(pixel_format),
             exposure=settings.exposure,
             frame_rate=self._capture.get(cv2.CAP_PROP_FPS) or NAN,
+            gain=settings.gain,
         )
 
     @property
@@ -124,11 +122,22 @@ class V4L2Device:
     def trigger(self) -> None:
         raise InputError("trigger()", "a V4L2 camera", "one that has a trigger")
 
+    def adjust(self, exposure: float, gain: float) -> None:
+        self._set_exposure_and_gain(exposure, gain)
+        self._state = replace(self._state, exposure=exposure, gain=gain)
+
     def is_alive(self) -> bool:
         return Path(self._path).exists()
 
     def close(self) -> None:
         self._capture.release()
+
+    def _set_exposure_and_gain(self, exposure: float, gain: float) -> None:
+        if not math.isnan(exposure):
+            self._set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL, "exposure")
+            self._set(cv2.CAP_PROP_EXPOSURE, round(exposure / _EXPOSURE_UNIT), "exposure")
+        if not math.isnan(gain):
+            self._set(cv2.CAP_PROP_GAIN, gain, "gain")
 
     def _set(self, prop: int, value: float, setting: str) -> None:
         if not self._capture.set(prop, value):

@@ -138,12 +138,7 @@ def apply_settings(features: Features, settings: CameraSettings, name: str) -> D
     pixel_format = settings.pixel_format or _deepest(features, name)
     _choose(features, "pixel_format", "PixelFormat", pixel_format)
     _set_region(features, settings.region)
-    if not math.isnan(settings.exposure):
-        _set_if_there(features, "ExposureAuto", "Off")
-        _set_number(features, *_EXPOSURE, settings.exposure)
-    if not math.isnan(settings.gain):
-        _set_if_there(features, "GainAuto", "Off")
-        _set_number(features, *_GAIN, settings.gain)
+    _set_exposure_and_gain(features, settings.exposure, settings.gain)
     _set_trigger(features, settings)
     if not settings.triggered and not math.isnan(settings.frame_rate):
         _set_if_there(features, "AcquisitionFrameRateEnable", True)
@@ -158,7 +153,25 @@ def apply_settings(features: Features, settings: CameraSettings, name: str) -> D
         frame_rate=settings.frame_rate
         if settings.triggered
         else _read_number(features, (*_RESULTING_RATE, *_FRAME_RATE[1]), 1.0) or NAN,
+        gain=_read_number(features, *_GAIN[1:]),
     )
+
+
+def adjusted(features: Features, state: DeviceState, exposure: float, gain: float) -> DeviceState:
+    """Set exposure and gain (NaN: leave it) of a running camera; ``state`` as it is then."""
+    _set_exposure_and_gain(features, exposure, gain)
+    return dataclasses.replace(
+        state, exposure=_read_number(features, *_EXPOSURE[1:]), gain=_read_number(features, *_GAIN[1:])
+    )
+
+
+def _set_exposure_and_gain(features: Features, exposure: float, gain: float) -> None:
+    if not math.isnan(exposure):
+        _set_if_there(features, "ExposureAuto", "Off")
+        _set_number(features, *_EXPOSURE, exposure)
+    if not math.isnan(gain):
+        _set_if_there(features, "GainAuto", "Off")
+        _set_number(features, *_GAIN, gain)
 
 
 def _set_by_text(features: Features, name: str, text: str) -> None:

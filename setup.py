@@ -23,6 +23,10 @@ setup(
         (f"share/{NAME}/bags/sample", sorted(glob("bags/sample/*"))),
     ],
     install_requires=["setuptools"],  # the rest: package.xml for rosdep, requirements/ for pip
+    extras_require={  # camera drivers, see docs/cameras.md; Aravis itself comes from the system
+        "basler": ["pypylon==26.9"],
+        "genicam": ["harvesters==1.4.3", "genicam==1.6.0"],
+    },
     python_requires=">=3.10",
     zip_safe=False,
     author="mems6dof developers",
@@ -38,6 +42,7 @@ setup(
             "pose_estimator = mems6dof_ros.nodes.pose_estimator:main",
             "pipeline = mems6dof_ros.nodes.pipeline:main",
             "recorder = mems6dof_ros.nodes.recorder:main",
+            "calibrator = mems6dof_ros.nodes.calibrator:main",
             "controller = mems6dof_ros.nodes.controller:main",
             "monitor = mems6dof_ros.nodes.monitor:main",
             "foxglove_bridge = mems6dof_ros.nodes.foxglove_bridge:main",

@@ -17,7 +17,7 @@ from mems6dof_ros.sources.cameras.device import (
 )
 from mems6dof_ros.sources.cameras.settings import CameraSettings, adjusted, apply_settings, parse_settings
 
-_INSTALL = "pip install pypylon"
+_INSTALL = "pip install pypylon==26.9"
 
 #: s, to wait until the camera can take the next trigger.
 _TRIGGER_PATIENCE = 1.0

@@ -21,7 +21,7 @@ from mems6dof_ros.sources.cameras.device import (
 )
 from mems6dof_ros.sources.cameras.settings import CameraSettings, adjusted, apply_settings
 
-_INSTALL = "pip install harvesters"
+_INSTALL = "pip install harvesters==1.4.3 genicam==1.6.0"
 
 #: The GenTL standard's search path of producers.
 _PRODUCER_PATH = "GENICAM_GENTL64_PATH"

@@ -3,7 +3,7 @@
 One file is all that localizing needs: the forward model, the fit that it was made with and must be used
 with, the camera's numbers. ``calibration_id`` is a hash of exactly that content, so that equal
 calibrations have equal names whoever wrote the file and when. A reader for every version ever written
-stays in ``_READERS``.
+stays in ``_READERS``. Version 2 adds a field correction; without one, files stay as in version 1.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ import yaml
 from numpy.typing import NDArray
 
 from mems6dof_ros.calibration.estimator import METHODS, SHAPE, Estimator
+from mems6dof_ros.calibration.field_correction import FieldCorrection
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
+from mems6dof_ros.calibration.field_modes import FieldModes
 from mems6dof_ros.calibration.interface import Positions
 from mems6dof_ros.calibration.moments import residual_moments
 from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
@@ -32,7 +34,6 @@ from mems6dof_ros.localization.fitting import WEIGHTINGS
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
 FORMAT = "mems6dof-calibration"
-VERSION = 1
 DEFAULT_METHOD = "joint"
 #: Standard deviations by which two estimates of z differ if they are on different branches.
 BRANCHES_APART = 5.0
@@ -52,6 +53,7 @@ class ValidRange:
 @dataclass(frozen=True)
 class Calibration:
     """A calibration of the optics; implements OpticalCalibration. ``method``: see estimator.METHODS.
+    ``correction``: of the field error, None before it was measured.
 
     ``provenance``: plain values for the file (software, settings, inputs, quality), not part of the id.
     """
@@ -65,10 +67,14 @@ class Calibration:
     valid: ValidRange
     method: str = DEFAULT_METHOD
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    correction: FieldCorrection | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError("calibration method", repr(self.method), f"one of {', '.join(METHODS)}")
+        if self.correction is not None and self.correction.method != self.method:
+            made = f"{self.correction.method!r}, with which the field correction was measured"
+            raise InputError("calibration method", repr(self.method), made)
 
     @cached_property
     def calibration_id(self) -> str:
@@ -105,11 +111,17 @@ class Calibration:
             outside = _outside(x, self.valid.x) | _outside(y, self.valid.y)
             brightness = _outside(fits.flux, self.valid.flux)
         flags = np.where(outside, Flag.OUT_OF_FIELD, 0) | np.where(brightness, Flag.OUT_OF_BRIGHTNESS, 0)
-        return replace(found, flags=found.flags | flags.astype(np.uint32))
+        position = self.correction.apply(found.position) if self.correction else found.position
+        return replace(found, position=position, flags=found.flags | flags.astype(np.uint32))
 
     def with_method(self, method: str) -> Calibration:
-        """The same calibration read by another ``method``; InputError for an unknown one."""
+        """The same calibration read by another ``method``; InputError for an unknown one, and for one with
+        which the field correction was not measured."""
         return replace(self, method=method)
+
+    def with_correction(self, correction: FieldCorrection | None) -> Calibration:
+        """The same calibration with another ``correction`` of the field error, or without."""
+        return replace(self, correction=correction)
 
 
 def _guarded(found: Positions, shape: Positions) -> Positions:
@@ -130,12 +142,14 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     """Write ``calibration`` to ``path``: completed under another name first, so never half-written."""
     document = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": 1 if calibration.correction is None else 2,
         "calibration_id": calibration.calibration_id,
         "method": calibration.method,
         "provenance": dict(calibration.provenance),
         **_content(calibration),
     }
+    if calibration.correction is not None:
+        document["field_correction"]["provenance"] = dict(calibration.correction.provenance)
     text = _HEADER + yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110)
     path = Path(path)
     unfinished = path.with_name(path.name + ".part")
@@ -186,11 +200,27 @@ _HEADER = """\
 # names; features are, in this order, dx and dy (m), ln(sigma_x/px), ln(sigma_y/px), atanh(rho), rho_amp.
 # Curves: sum over j, m of coefficients[feature][j][m] Z_j(X/R, Y/R) T_m(u scaled to -1..1), Z Zernike in
 # OSA/ANSI order with unit rms, T Chebyshev, R disc_radius_m, u = z - focus_surface(X, Y).
+# field_correction (if any): measured minus true position, sum over k of coefficients_m[k] mode_k(X, Y); mode
+# "x:ab" moves x alone by L_a(X/half width) L_b(Y/half height), L Legendre with 1 rms over the field.
 """
 
 
 def _content(calibration: Calibration) -> dict[str, Any]:
-    """Everything that determines positions, as plain values: the body of a version-1 file."""
+    """Everything that determines positions, as plain values: the body of a file."""
+    content = _content_of_optics(calibration)
+    if (correction := calibration.correction) is not None:
+        content["field_correction"] = {
+            "half_size_m": [float(v) for v in correction.modes.half_size],
+            "degree": int(correction.modes.degree),
+            "method": correction.method,
+            "modes": list(correction.modes.names),
+            "coefficients_m": correction.mean.tolist(),
+            "covariance_m2": correction.covariance.tolist(),
+        }
+    return content
+
+
+def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
     model, camera, valid = calibration.model, calibration.camera, calibration.valid
     return {
         "optics": {
@@ -311,4 +341,17 @@ def _read_version_1(fields: _Fields) -> Calibration:
     )
 
 
-_READERS = {1: _read_version_1}
+def _read_version_2(fields: _Fields) -> Calibration:
+    stored = fields.section("field_correction")
+    half_width, half_height = stored.array("half_size_m", 2)
+    modes = FieldModes((float(half_width), float(half_height)), int(stored.number("degree")))
+    if stored("modes") != list(modes.names):
+        raise InputError(
+            "calibration: field_correction: modes", repr(stored("modes")), repr(list(modes.names))
+        )
+    mean, covariance = stored.array("coefficients_m", -1), stored.array("covariance_m2", -1, -1)
+    correction = FieldCorrection(modes, mean, covariance, stored("method"), stored("provenance"))
+    return _read_version_1(fields).with_correction(correction)
+
+
+_READERS = {1: _read_version_1, 2: _read_version_2}

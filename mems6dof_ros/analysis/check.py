@@ -59,6 +59,10 @@ def check_bag(path: str | Path) -> Check:
             result.topics[topic] = (kind, count)
             if count != announced[topic]:
                 result.problems.append(f"{topic}: {announced[topic]} messages announced, {count} found")
+        for file in bag.unlisted:
+            result.problems.append(f"{file}: not in metadata.yaml; 'mems6dof recover' writes it anew")
+    if not seen:
+        result.problems.append("no messages")
     for name, found in seen.items():
         if found.backwards and found.kind in (_FRAME_INFO, *_OF_A_FRAME):
             result.problems.append(f"{name}: {found.backwards} stamps earlier than the one before")

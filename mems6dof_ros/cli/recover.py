@@ -12,7 +12,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "recover",
         help="complete a bag that was cut off",
         description="Complete an .mcap file, or all those of a bag, in place: it is cut behind its last "
-        "whole chunk and gets the index that it lacks. A complete file is left as it is.",
+        "whole chunk and gets the index that it lacks; damaged chunks before that are set aside. The "
+        "bag's metadata.yaml is then written anew. A complete file is left as it is.",
     )
     parser.add_argument("path", type=Path, help="bag or .mcap file; it is changed")
     parser.set_defaults(run=run)
@@ -23,6 +24,6 @@ def run(args: argparse.Namespace) -> int:
     from mems6dof_ros.recording.recover import recover
 
     for result in recover(args.path):
-        state = "was complete" if result.complete else f"completed, {result.lost} bytes cut off"
+        state = "was complete" if result.complete else f"completed, {result.lost} bytes could not be read"
         print(f"{result.path}: {result.messages} messages, {state}")
     return 0

@@ -12,6 +12,7 @@ import errno
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +20,7 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 import yaml
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
@@ -35,7 +36,7 @@ from mems6dof_ros.recording.metadata import (
     metadata_text,
     write_metadata,
 )
-from mems6dof_ros.recording.recover import recover
+from mems6dof_ros.recording.recover import complete_file, mcap_files
 
 __all__ = ["BagReader", "BagWriter", "Channel", "Qos", "Recorded"]
 
@@ -51,7 +52,11 @@ class BagWriter:
     of the process; what is older than ``sync_period`` s survives a loss of power. Leaving the context by
     an exception completes the files all the same. Not safe for use by several threads at once.
 
-    With less than ``reserve`` bytes left on the disk, ``flush`` completes the bag and raises OSError
+    The first ``flush`` after which a file has ``split_size`` bytes, or spans ``split_duration`` s, completes
+    it (0: never); the next message opens another. Every file is readable by itself: it begins with the
+    attachments and with the last messages of each transient-local channel, as many as its depth.
+
+    With less than ``minimum_free`` bytes left on the disk, ``flush`` completes the bag and raises OSError
     (ENOSPC). Any other OSError also ends it, with what is whole completed as far as the disk allows.
     """
 
@@ -62,7 +67,9 @@ class BagWriter:
         compression: str = "none",
         provenance: Mapping[str, str] | None = None,
         sync_period: float = 1.0,
-        reserve: int = 64 << 20,
+        split_size: int = 0,
+        split_duration: float = 0.0,
+        minimum_free: int = 64 << 20,
     ) -> None:
         self.path = Path(path)
         if compression not in COMPRESSIONS:
@@ -72,11 +79,14 @@ class BagWriter:
         self.path.mkdir(parents=True, exist_ok=True)
         self.provenance = {"mems6dof_ros": __version__, **(provenance or {})}
         self._compression = COMPRESSIONS[compression]
-        self._sync_period, self._reserve = sync_period, reserve
-        self._channels: list[Channel] = []
-        self._attachments: list[tuple[str, bytes, str]] = []
+        self._sync_period, self._minimum_free = sync_period, minimum_free
+        self._split_size, self._split_ns = split_size, round(split_duration * 1e9)
+        self._latched: dict[Channel, deque[_Message]] = {}
+        self._written: dict[Channel, int] = {}
+        self._attachments: dict[str, tuple[bytes, str]] = {}
         self._files: list[_File] = []
-        self.split()
+        self._ended = False
+        self._open_file()
 
     def __enter__(self) -> BagWriter:
         return self
@@ -89,10 +99,13 @@ class BagWriter:
     def add_channel(self, topic: str, typename: str, qos: Iterable[Qos] = (Qos(),)) -> Channel:
         """Announce a topic of type ``package/msg/Name``; InputError where the type is unknown here."""
         channel = Channel(topic, typename, tuple(qos))
-        if channel not in self._channels:
+        if channel not in self._written:
             definition(typename)  # fails here, before any file knows the channel
-            self._channels.append(channel)
-            self._files[-1].add_channel(channel)
+            self._written[channel] = 0
+            if depths := [q.depth for q in channel.qos if q.durability == "transient_local"]:
+                self._latched[channel] = deque(maxlen=max(depths))
+            if not self._files[-1].closed:
+                self._files[-1].add_channel(channel)
         return channel
 
     def write(
@@ -104,72 +117,108 @@ class BagWriter:
         sequence: int = 0,
     ) -> None:
         """Append one CDR message: received at ``log_time_ns``, sent at ``publish_time_ns``."""
+        message = _Message(bytes(data), log_time_ns, publish_time_ns or log_time_ns, sequence)
         with self._saving_what_is_whole():
-            self._files[-1].write(channel, data, log_time_ns, publish_time_ns or log_time_ns, sequence)
+            if self._files[-1].closed:
+                self._open_file(log_time_ns)
+            self._files[-1].write(channel, message)
+        self._written[channel] += 1
+        if channel in self._latched:
+            self._latched[channel].append(message)
 
     def write_message(self, topic: str, message: Message, log_time_ns: int) -> None:
         """Append one neutral message, announcing its topic on first use (offline writing)."""
         channel = self.add_channel(topic, message.type)
-        sequence = 1 + sum(file.counts.get(channel, 0) for file in self._files)
-        self.write(channel, serialize(message), log_time_ns, sequence=sequence)
+        self.write(channel, serialize(message), log_time_ns, sequence=1 + self._written[channel])
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        """Attach a file's content, for instance the calibration, to this and all later files."""
-        self._attachments.append((name, data, media_type))
-        with self._saving_what_is_whole():
-            self._files[-1].attach(name, data, media_type)
+        """Attach a file's content, for instance the calibration, to this and all later files; another of
+        the same ``name`` replaces it in those."""
+        self._attachments[name] = data, media_type
+        if not self._files[-1].closed:
+            with self._saving_what_is_whole():
+                self._files[-1].attach(name, data, media_type)
 
     def flush(self) -> None:
         """Hand everything to the operating system, and to the disk once per ``sync_period``."""
+        file = self._files[-1]
+        if file.closed:
+            return
         with self._saving_what_is_whole():
-            self._files[-1].flush(self._sync_period)
-        if shutil.disk_usage(self.path).free < self._reserve:
+            file.flush(self._sync_period)
+        if (free := shutil.disk_usage(self.path).free) < self._minimum_free:
             self.close()
-            raise OSError(errno.ENOSPC, "the disk is almost full; the bag is complete so far", str(self.path))
+            reason = f"the disk is almost full, {free >> 20} MiB left; the bag is complete so far"
+            raise OSError(errno.ENOSPC, reason, str(self.path))
+        if (self._split_size and file.size >= self._split_size) or (
+            self._split_ns and file.duration_ns >= self._split_ns
+        ):
+            self.split()
 
     def split(self) -> None:
-        """Complete the current file and go on in a new one that is readable by itself."""
-        if self._files:
+        """Complete the current file; the next message opens another. Nothing where it holds no message."""
+        file = self._files[-1]
+        if file.message_count and not file.closed:
             with self._saving_what_is_whole():
-                self._files[-1].close()
-        path = self.path / f"{self.path.name}_{len(self._files)}.mcap"
-        self._files.append(_File(path, self._compression, self.provenance))
-        for channel in self._channels:
-            self._files[-1].add_channel(channel)
-        for attachment in self._attachments:
-            self._files[-1].attach(*attachment)
-        self._write_metadata()
+                file.close()
+                self._write_metadata()
 
     def close(self) -> None:
         """Complete the files and the metadata; harmless when repeated."""
-        if self._files[-1].closed:
-            return
-        with self._saving_what_is_whole():
-            self._files[-1].close()
-            self._write_metadata()
+        self._ended = True
+        if not self._files[-1].closed:
+            with self._saving_what_is_whole():
+                self._files[-1].close()
+                self._write_metadata()
+
+    @property
+    def message_count(self) -> int:
+        """Messages written, without those repeated at the beginning of files."""
+        return sum(self._written.values())
+
+    @property
+    def file(self) -> Path:
+        """The last file."""
+        return self._files[-1].path
+
+    def _open_file(self, log_time_ns: int = 0) -> None:
+        if self._ended:
+            raise ValueError(f"{self.path} is closed")
+        path = self.path / f"{self.path.name}_{len(self._files)}.mcap"
+        file = _File(path, self._compression, self.provenance)
+        self._files.append(file)
+        for channel in self._written:
+            file.add_channel(channel)
+        for name, (data, media_type) in self._attachments.items():
+            file.attach(name, data, media_type)
+        for channel, messages in self._latched.items():
+            for message in messages:  # received anew, as it were: files follow each other in time
+                file.write(channel, message._replace(log_ns=log_time_ns))
+        self._write_metadata()  # lists a file that is not complete: readers complain rather than read less
 
     @contextmanager
     def _saving_what_is_whole(self) -> Iterator[None]:
         try:
             yield
         except OSError:
+            self._ended = True
             self._files[-1].abandon()
+            # The others are complete; reading them again would take as long as they are large.
             with suppress(OSError, InputError):
-                recover(self.path)
+                last = complete_file(self._files[-1].path).summary
+                self._write_metadata(last)
             raise
 
-    @property
-    def size(self) -> int:
-        """Bytes flushed to the current file."""
-        return self._files[-1].size
+    def _write_metadata(self, last: FileSummary | None = None) -> None:
+        files = [file.summary() for file in self._files]
+        write_metadata(self.path, [*files[:-1], last or files[-1]], self.provenance)
 
-    @property
-    def message_count(self) -> int:
-        """Messages written to all files."""
-        return sum(file.message_count for file in self._files)
 
-    def _write_metadata(self) -> None:
-        write_metadata(self.path, [file.summary() for file in self._files], self.provenance)
+class _Message(NamedTuple):
+    data: bytes
+    log_ns: int
+    publish_ns: int
+    sequence: int
 
 
 class _File:
@@ -187,9 +236,14 @@ class _File:
         self._stream = path.open("xb")
         # The library also writes offsets to groups of the summary that are empty, which validators refuse.
         self._writer = Writer(self._stream, compression=compression, use_summary_offsets=False)
-        self._writer.start(profile="ros2", library=f"mems6dof_ros {__version__}")
-        self._writer.add_metadata(PROVENANCE, dict(provenance))
-        self._writer.flush()
+        try:
+            self._writer.start(profile="ros2", library=f"mems6dof_ros {__version__}")
+            self._writer.add_metadata(PROVENANCE, dict(provenance))
+            self._writer.flush()
+        except OSError:
+            self.abandon()
+            path.unlink()
+            raise
 
     @property
     def message_count(self) -> int:
@@ -197,7 +251,13 @@ class _File:
 
     @property
     def size(self) -> int:
-        return self._stream.tell() if not self._stream.closed else self.path.stat().st_size
+        """Bytes written so far; while it is open."""
+        return self._stream.tell()
+
+    @property
+    def duration_ns(self) -> int:
+        """From the first message to the last."""
+        return (self.end_ns or 0) - (self.start_ns or 0)
 
     def summary(self) -> FileSummary:
         hashes = {channel.type: definition(channel.type).type_hash for channel in self.counts}
@@ -214,10 +274,9 @@ class _File:
         self._ids[channel] = self._writer.register_channel(channel.topic, "cdr", schema_id, metadata)
         self.counts[channel] = 0
 
-    def write(
-        self, channel: Channel, data: bytes | memoryview, log_ns: int, publish_ns: int, sequence: int
-    ) -> None:
-        self._writer.add_message(self._ids[channel], log_ns, bytes(data), publish_ns, sequence)
+    def write(self, channel: Channel, message: _Message) -> None:
+        data, log_ns, publish_ns, sequence = message
+        self._writer.add_message(self._ids[channel], log_ns, data, publish_ns, sequence)
         self.counts[channel] += 1
         self.start_ns = log_ns if self.start_ns is None else min(self.start_ns, log_ns)
         self.end_ns = log_ns if self.end_ns is None else max(self.end_ns, log_ns)
@@ -270,6 +329,8 @@ class BagReader:
         self.path = Path(path)
         if not self.path.exists():
             raise InputError(str(self.path), "nothing there", "a rosbag2 directory, .mcap or .db3 file")
+        if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
+            raise InputError(str(self.path), "a directory without metadata.yaml", _instead_of(self.path))
         with _readable(self.path):
             self._reader = AnyReader([self.path], default_typestore=typestore())
             self._reader.open()
@@ -293,6 +354,15 @@ class BagReader:
             counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
         return counts
 
+    @property
+    def unlisted(self) -> list[str]:
+        """Names of .mcap files in the directory that the bag's metadata.yaml does not know."""
+        if not self.path.is_dir():
+            return []
+        text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
+        listed = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [file.name for file in mcap_files(self.path) if file.name not in map(os.path.basename, listed)]
+
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[Recorded]:
         """Messages of ``topics`` (all by default) in the order in which they were received."""
         wanted = None if topics is None else set(topics)
@@ -305,28 +375,34 @@ class BagReader:
                 yield Recorded(connection.topic, connection.msgtype, log_time_ns, message)
 
     def attachments(self) -> dict[str, bytes]:
-        """Attachments by name, of the first MCAP file that has them."""
+        """Attachments by name; of several with one name, the last."""
+        found: dict[str, bytes] = {}
         with _readable(self.path):
-            for path in self._mcap_files():
-                with path.open("rb") as stream:
-                    found = {a.name: a.data for a in make_reader(stream).iter_attachments()}
-                if found:
-                    return found
-        return {}
+            for reader in self._mcap_readers():
+                found |= {a.name: a.data for a in reader.iter_attachments()}
+        return found
 
     def provenance(self) -> dict[str, str]:
         """What BagWriter was told of the recording; empty for other people's bags."""
         with _readable(self.path):
-            for path in self._mcap_files():
-                with path.open("rb") as stream:
-                    for record in make_reader(stream).iter_metadata():
-                        if record.name == PROVENANCE:
-                            return dict(record.metadata)
+            for reader in self._mcap_readers():
+                for record in reader.iter_metadata():
+                    if record.name == PROVENANCE:
+                        return dict(record.metadata)
         return {}
 
-    def _mcap_files(self) -> list[Path]:
-        paths = sorted(self.path.glob("*.mcap")) if self.path.is_dir() else [self.path]
-        return [path for path in paths if path.suffix == ".mcap"]
+    def _mcap_readers(self) -> Iterator[McapReader]:
+        for path in mcap_files(self.path):
+            with path.open("rb") as stream:
+                yield make_reader(stream)
+
+
+def _instead_of(path: Path) -> str:
+    """What a directory without metadata.yaml offers instead."""
+    if mcap_files(path):
+        return "a rosbag2 directory; 'mems6dof recover' writes it anew"
+    databases = sorted(path.glob("*.db3"))
+    return f"a rosbag2 directory; or read {databases[0]} itself" if databases else "a rosbag2 directory"
 
 
 @contextmanager
@@ -338,6 +414,5 @@ def _readable(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         found = " ".join(str(error).split()) or type(error).__name__
-        mcap = path.suffix == ".mcap" or any(path.glob("*.mcap"))
-        advice = "; 'mems6dof recover' completes one that was cut off" if mcap else ""
+        advice = "; 'mems6dof recover' completes one that was cut off" if mcap_files(path) else ""
         raise InputError(str(path), found, f"a readable bag{advice}") from error

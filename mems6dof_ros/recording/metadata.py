@@ -42,11 +42,11 @@ class Qos:
 
     @classmethod
     def from_profile(cls, plain: Mapping[str, Any]) -> Qos:
-        """The inverse of ``profile``."""
+        """The inverse of ``profile``; TypeError, KeyError or ValueError for anything else."""
         values = {field.name: plain[field.name] for field in fields(cls) if field.name in plain}
         for name in _DURATIONS:
             if name in values:
-                values[name] = values[name]["sec"] * 10**9 + values[name]["nsec"]
+                values[name] = int(values[name]["sec"]) * 10**9 + int(values[name]["nsec"])
         return cls(**values)
 
 

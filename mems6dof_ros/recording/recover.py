@@ -1,7 +1,8 @@
-"""Completing MCAP files that a crash, a kill or a full disk left without their end.
+"""Completing MCAP files that a crash, a kill, a full disk or a bad sector left damaged.
 
 What is whole stays where it is: the file is cut behind its last whole chunk, and gets the summary and the
-footer that it lacks. No message is copied, so a long recording takes no second place on the disk.
+footer that it lacks; a damaged chunk before that is marked as a record that readers pass over. No message
+is copied, so a long recording takes no second place on the disk.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import yaml
 from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from mems6dof_ros.errors import InputError
@@ -27,9 +30,13 @@ from mems6dof_ros.recording.metadata import PROVENANCE, Channel, FileSummary, Qo
 _HEAD = struct.Struct("<BQ")  # of a record: opcode, length
 _MESSAGE = struct.Struct("<HIQ")  # of a message: channel, sequence, log time
 
+#: Opcodes from here on are private: every reader passes over such records.
+_PRIVATE = 0x80
+
 
 class Recovered(NamedTuple):
-    """What became of a file: was it ``complete`` before, ``messages`` in it, ``lost`` bytes cut off."""
+    """What became of a file: was it ``complete`` before, ``messages`` in it, ``lost`` bytes that could not be
+    read: cut off behind the last whole chunk, or set aside between whole ones."""
 
     path: Path
     complete: bool
@@ -37,12 +44,21 @@ class Recovered(NamedTuple):
     lost: int
 
 
+class Completed(NamedTuple):
+    """A completed file: what became of it, what it holds, what its writer was told of the recording."""
+
+    result: Recovered
+    summary: FileSummary
+    provenance: dict[str, str]
+
+
 @dataclass
 class _Contents:
     """What a scan of a file found up to ``end``, the offset behind the last whole record.
 
     ``index``: entries (log time, offset) by channel of the last chunk, if nothing else follows it, and
-    ``indexed`` those channels of which the file has them.
+    ``indexed`` those channels of which the file has them. ``damaged``: offsets and lengths of records before
+    ``end`` that cannot be read, ``lost`` their bytes and those behind ``end``.
     """
 
     end: int = 0
@@ -58,6 +74,8 @@ class _Contents:
     end_ns: int | None = None
     index: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     indexed: set[int] = field(default_factory=set)
+    damaged: list[int] = field(default_factory=list)
+    lost: int = 0
 
     def note_message(self, channel: int, log_ns: int) -> None:
         self.counts[channel] = self.counts.get(channel, 0) + 1
@@ -65,67 +83,116 @@ class _Contents:
         self.end_ns = log_ns if self.end_ns is None else max(self.end_ns, log_ns)
 
 
+def mcap_files(path: Path) -> list[Path]:
+    """The .mcap files of a bag in their order, or ``path`` itself where it is one."""
+    if path.is_dir():
+        return sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
+    return [path] if path.suffix == ".mcap" else []
+
+
 def recover(path: Path) -> list[Recovered]:
     """Complete an .mcap file, or all those of a bag, whose ``metadata.yaml`` is then written anew.
 
-    Raises InputError where ``path`` is neither, or a file is no MCAP file at all.
+    A file of a bag that was not even begun, because the disk was full, is left out of it. Raises
+    InputError where ``path`` is neither, or a file is no MCAP file at all.
     """
     if not path.is_dir():
-        return [_complete(path)[0]]
-    files = sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
-    if not files:
-        raise InputError(str(path), "no .mcap file", "a bag, or an .mcap file")
-    results: list[Recovered] = []
-    summaries: list[FileSummary] = []
-    provenance: dict[str, str] = {}
-    for file in files:
-        result, contents = _complete(file)
-        results.append(result)
-        summaries.append(_summary(file, contents))
-        provenance |= contents.provenance
-    write_metadata(path, summaries, provenance)
-    return results
+        return [complete_file(path).result]
+    files = mcap_files(path)
+    begun = [file for file in files if file.stat().st_size > len(MCAP0_MAGIC)]
+    if not begun:
+        found = (
+            "empty .mcap files" if files else "an sqlite3 bag" if any(path.glob("*.db3")) else "no .mcap file"
+        )
+        raise InputError(str(path), found, "a bag with MCAP storage")
+    completed = [complete_file(file) for file in begun]
+    provenance = {name: value for one in completed for name, value in one.provenance.items()}
+    write_metadata(path, [one.summary for one in completed], provenance)
+    return [one.result for one in completed]
 
 
-def _complete(path: Path) -> tuple[Recovered, _Contents]:
+def complete_file(path: Path) -> Completed:
+    """Complete one .mcap file; InputError where it is none, or cannot be read or changed."""
     try:
         with path.open("r+b") as stream:
             size = path.stat().st_size
+            if not size:
+                raise InputError(str(path), "an empty file", "an .mcap file with something in it")
             contents = _scan(stream, size, path)
             if not contents.complete:
+                for offset in contents.damaged:
+                    stream.seek(offset)
+                    stream.write(bytes([_PRIVATE]))
                 stream.seek(contents.end)
                 stream.truncate()
                 stream.write(_ending(contents))
                 stream.flush()
                 os.fsync(stream.fileno())
     except OSError as error:
-        raise InputError(
-            str(path), error.strerror or str(error), "an .mcap file that can be changed"
-        ) from None
-    lost = 0 if contents.complete else size - contents.end
-    return Recovered(path, contents.complete, sum(contents.counts.values()), lost), contents
+        reason = error.strerror or str(error)
+        raise InputError(str(path), reason, "an .mcap file that can be changed") from None
+    count = sum(contents.counts.values())
+    result = Recovered(path, contents.complete, count, contents.lost)
+    return Completed(result, _summary(path, contents), contents.provenance)
 
 
 def _scan(stream: BinaryIO, size: int, path: Path) -> _Contents:
-    """Read record by record until the data ends, or something is not whole."""
+    """Read record by record until the data ends, or the records do."""
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise InputError(str(path), "no MCAP file", "the magic number of MCAP at its beginning")
-    contents = _Contents(end=stream.tell())
+    contents = _Contents(end=len(MCAP0_MAGIC))
+    summary = _summary_section(stream)
+    if summary:  # should the chunk that announces them be damaged
+        contents.schemas, contents.channels = dict(summary.schemas), dict(summary.channels)
+    damaged: list[tuple[int, int]] = []  # behind the last whole record
+    orphans = ended = False  # indexes of a damaged chunk; the end of the data
     for opcode, offset, length in _heads(stream, size):
         if opcode == Opcode.DATA_END:
-            stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
-            contents.complete = stream.read() == MCAP0_MAGIC
+            ended = True
             break
+        total = _HEAD.size + length
+        if opcode == Opcode.MESSAGE_INDEX and orphans:
+            continue
         try:
-            _note(contents, opcode, offset, length, stream)
+            _note(contents, opcode, offset, stream.read(length))
         except Exception:  # whatever is wrong with it, this record is not whole
-            break
+            orphans = opcode == Opcode.CHUNK
+            damaged.append((offset, total))
+            continue
+        orphans = opcode >= _PRIVATE  # that was set aside by an earlier recovery
         if opcode not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
             contents.index, contents.indexed = {}, set()
         # An index counts when all of it is there; otherwise it will be written anew behind the chunk.
         if opcode != Opcode.MESSAGE_INDEX or contents.indexed == contents.index.keys():
-            contents.end = offset + _HEAD.size + length
+            contents.end = offset + total
+            contents.damaged += [start for start, _ in damaged]
+            contents.lost += sum(length for _, length in damaged)
+            damaged = []
+    contents.complete = ended and not contents.lost and not damaged and _fits(summary, stream, contents)
+    contents.lost += sum(length for _, length in damaged) if ended else size - contents.end
     return contents
+
+
+def _summary_section(stream: BinaryIO) -> Summary | None:
+    """What the file says of itself at its end, where it can be read."""
+    try:
+        stream.seek(0)
+        return make_reader(stream).get_summary()
+    except Exception:  # there is none, or it is not whole
+        return None
+
+
+def _fits(summary: Summary | None, stream: BinaryIO, contents: _Contents) -> bool:
+    """Does the end of the file say what the scan found? It need not say everything."""
+    stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+    if stream.read() != MCAP0_MAGIC:
+        return False
+    if summary is None:
+        return not contents.chunks
+    chunks = [(index.chunk_start_offset, index.chunk_length) for index in summary.chunk_indexes]
+    found = [(index.chunk_start_offset, index.chunk_length) for index in contents.chunks]
+    count = summary.statistics.message_count if summary.statistics else sum(contents.counts.values())
+    return sorted(chunks) == found and count == sum(contents.counts.values())
 
 
 def _heads(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
@@ -140,18 +207,21 @@ def _heads(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
         offset += _HEAD.size + length
 
 
-def _note(contents: _Contents, opcode: int, offset: int, length: int, stream: BinaryIO) -> None:
-    total = _HEAD.size + length
+def _note(contents: _Contents, opcode: int, offset: int, content: bytes) -> None:
+    total = _HEAD.size + len(content)
+    stream = ReadDataStream(io.BytesIO(content))
     if opcode == Opcode.CHUNK:
-        _note_chunk(contents, records.Chunk.read(ReadDataStream(stream)), offset, total)
+        _note_chunk(contents, records.Chunk.read(stream), offset, total)
     elif opcode == Opcode.MESSAGE_INDEX:
-        index = records.MessageIndex.read(ReadDataStream(stream))
+        index = records.MessageIndex.read(stream)
+        if contents.index.get(index.channel_id) != index.records:
+            raise ValueError("an index of other messages")
         contents.indexed.add(index.channel_id)
         chunk = contents.chunks[-1]
         chunk.message_index_offsets[index.channel_id] = offset
         chunk.message_index_length += total
     elif opcode == Opcode.ATTACHMENT:
-        attachment = records.Attachment.read(ReadDataStream(stream))
+        attachment = records.Attachment.read(stream)
         contents.attachments.append(
             records.AttachmentIndex(
                 offset=offset,
@@ -164,12 +234,12 @@ def _note(contents: _Contents, opcode: int, offset: int, length: int, stream: Bi
             )
         )
     elif opcode == Opcode.METADATA:
-        metadata = records.Metadata.read(ReadDataStream(stream))
+        metadata = records.Metadata.read(stream)
         contents.metadata.append(records.MetadataIndex(offset=offset, length=total, name=metadata.name))
         if metadata.name == PROVENANCE:
             contents.provenance = dict(metadata.metadata)
-    else:
-        _note_content(contents, opcode, stream.read(length))
+    elif opcode < _PRIVATE:
+        _note_content(contents, opcode, content)
 
 
 def _note_chunk(contents: _Contents, chunk: records.Chunk, offset: int, total: int) -> None:
@@ -182,6 +252,9 @@ def _note_chunk(contents: _Contents, chunk: records.Chunk, offset: int, total: i
         _note_content(inside, opcode, content)
         if opcode == Opcode.MESSAGE:
             channel, _, log_ns = _MESSAGE.unpack_from(content)
+            schema = inside.channels[channel].schema_id
+            if schema and schema not in inside.schemas:
+                raise ValueError("messages without their schema")
             index.setdefault(channel, []).append((log_ns, position))
     contents.schemas, contents.channels = inside.schemas, inside.channels
     contents.index, contents.indexed = index, set()
@@ -254,8 +327,15 @@ def _summary(path: Path, contents: _Contents) -> FileSummary:
     for number, channel in contents.channels.items():
         schema = contents.schemas.get(channel.schema_id)
         typename = schema.name if schema else ""
-        profiles = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
-        qos = tuple(Qos.from_profile(profile) for profile in profiles)
-        counts[Channel(channel.topic, typename, qos)] = contents.counts.get(number, 0)
+        known = Channel(channel.topic, typename, _qos(channel.metadata.get("offered_qos_profiles", "")))
+        counts[known] = counts.get(known, 0) + contents.counts.get(number, 0)
         hashes[typename] = channel.metadata.get("topic_type_hash", "")
     return FileSummary(path.name, contents.start_ns, contents.end_ns, counts, hashes)
+
+
+def _qos(text: str) -> tuple[Qos, ...]:
+    """Profiles as other writers put them, too; none where they cannot be read."""
+    try:
+        return tuple(Qos.from_profile(profile) for profile in yaml.safe_load(text) or ())
+    except (yaml.YAMLError, TypeError, KeyError, ValueError):
+        return ()

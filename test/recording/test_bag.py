@@ -136,6 +136,56 @@ def test_every_file_of_a_split_bag_stands_alone(tmp_path):
             assert single.attachments() == {"calibration.json": b"{}"}
 
 
+def test_files_are_split_between_cycles_and_read_as_one(tmp_path):
+    """By size, by time and by request; latched messages and attachments stand in each file."""
+    latched = Qos(durability="transient_local", depth=2)
+    notes = [messages.Message("std_msgs/msg/String", {"data": text}) for text in "abc"]
+    options = {"size": {"split_size": 20_000}, "time": {"split_duration": 0.1}, "request": {}}
+    for name, option in options.items():
+        with BagWriter(tmp_path / name, **option) as bag:
+            channel = bag.add_channel("/notes", "std_msgs/msg/String", (latched,))
+            for k, note in enumerate(notes):
+                bag.write(channel, messages.serialize(note), T0 + k, T0 + k, sequence=k)
+            for k in range(31):
+                bag.write_message("/frame_info", messages.frame_info(frame(k)), T0 + k * 10**7)
+                bag.write_message("/image_raw", messages.image(frame(k)), T0 + k * 10**7 + 5)
+                bag.flush()
+                if k == 3:
+                    bag.attach("parameters.yaml", b"{}")
+                if name == "request" and k in (9, 20, 30):
+                    bag.split()
+                    bag.split()  # nothing to complete
+        files = sorted((tmp_path / name).glob("*.mcap"), key=lambda file: int(file.stem.rpartition("_")[2]))
+        assert len(files) == {"size": 5, "time": 3, "request": 3}[name], name
+        with AnyReader([tmp_path / name]) as reader:
+            times = [time for _, time, _ in reader.messages()]
+            repeated = 2 * (len(files) - 1)
+            assert times == sorted(times)
+            assert len(times) == reader.message_count == 65 + repeated
+            assert {c.topic: c.msgcount for c in reader.connections}["/notes"] == 3 + repeated
+        metadata = yaml.safe_load((tmp_path / name / "metadata.yaml").read_text())
+        information = metadata["rosbag2_bagfile_information"]
+        assert information["relative_file_paths"] == [file.name for file in files]
+        counters = []
+        for file, listed in zip(files, information["files"], strict=True):
+            with file.open("rb") as stream:
+                reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+                found = list(reader.iter_decoded_messages())
+                assert listed["message_count"] == len(found) == reader.get_summary().statistics.message_count
+                assert [a.name for a in reader.iter_attachments()] == ["parameters.yaml"]
+            assert [m.data for _, c, _, m in found if c.topic == "/notes"][-2:] == ["b", "c"]
+            first = found[0][2]
+            assert listed["starting_time"]["nanoseconds_since_epoch"] == first.log_time
+            assert file == files[0] or (first.sequence, first.publish_time) == (1, T0 + 1)
+            infos = [m.frame_counter for _, c, _, m in found if c.topic == "/frame_info"]
+            images = [m.header.stamp for _, c, _, m in found if c.topic == "/image_raw"]
+            assert len(infos) == len(images)  # no cycle is torn apart
+            if name == "size":
+                assert file == files[-1] or 20_000 <= file.stat().st_size < 32_000
+            counters += infos
+        assert counters == list(range(31))
+
+
 def test_an_exception_while_writing_loses_nothing(tmp_path):
     with suppress(RuntimeError), BagWriter(tmp_path / "bag") as bag:
         for k in range(500):

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording import messages
@@ -134,3 +136,70 @@ def test_other_files_are_refused_and_left_alone(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"no \.mcap file"):
         recover(tmp_path / "empty")
+    (tmp_path / "empty" / "empty_0.db3").touch()
+    with pytest.raises(InputError, match="an sqlite3 bag"):
+        recover(tmp_path / "empty")
+    (tmp_path / "zero.mcap").touch()
+    with pytest.raises(InputError, match="an empty file"):
+        recover(tmp_path / "zero.mcap")
+
+
+def test_damage_in_the_middle_costs_that_chunk_only(bag):
+    """The chunk is set aside; the reader that goes by the index and the one that reads on pass over it."""
+    file = bag / "bag_0.mcap"
+    with file.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    data = bytearray(file.read_bytes())
+    for hit in (0, 3, 14):  # the first one announces the channels
+        data[chunks[hit].chunk_start_offset + chunks[hit].chunk_length - 5] ^= 1
+    file.write_bytes(data)
+    (result,) = recover(bag)
+    expected = [k for k in range(60) if k // 4 not in (0, 3, 14)]
+    lost = sum(chunks[hit].chunk_length for hit in (0, 3, 14))
+    assert result == (file, False, len(expected), lost)
+    assert read(bag) == expected
+    with file.open("rb") as stream:
+        found = [r.log_time - T0 for r in StreamReader(stream).records if isinstance(r, McapMessage)]
+    assert found == expected
+    assert recover(bag)[0].complete
+
+
+def test_an_end_that_contradicts_the_data_is_written_anew(bag):
+    file = bag / "bag_0.mcap"
+    whole = file.read_bytes()
+    with file.open("rb") as stream:
+        start = make_reader(stream).get_summary().chunk_indexes[-1]
+    position = whole.rindex(start.chunk_start_offset.to_bytes(8, "little"))
+    file.write_bytes(whole[:position] + b"\0" + whole[position + 1 :])
+    (result,) = recover(bag)
+    assert (result.complete, result.messages, result.lost) == (False, 60, 0)
+    assert read(bag) == list(range(60))
+
+
+def test_a_split_bag_is_completed_as_a_whole(tmp_path):
+    """Killed in its third file, which was only begun in the fourth, without metadata.yaml."""
+    latched = Qos(durability="transient_local", depth=1)
+    with BagWriter(tmp_path / "bag", provenance={"seed": "7"}) as writer:
+        notes = writer.add_channel("/notes", "std_msgs/msg/String", (latched,))
+        for k in range(12):
+            if k in (4, 8):
+                writer.split()
+            writer.write(
+                notes, messages.serialize(messages.Message("std_msgs/msg/String", {"data": str(k)})), T0 + k
+            )
+            writer.flush()
+    last = tmp_path / "bag" / "bag_2.mcap"
+    os.truncate(last, last.stat().st_size - 700)
+    (tmp_path / "bag" / "bag_3.mcap").touch()
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match="a directory without metadata"):
+        BagReader(tmp_path / "bag")
+    assert [result.complete for result in recover(tmp_path / "bag")] == [True, True, False]
+    with BagReader(tmp_path / "bag") as reader:
+        assert [m.message.data for m in reader.messages()] == [
+            *("0", "1", "2", "3"),
+            *("3", "4", "5", "6", "7"),
+            *("7", "8", "9", "10", "11"),
+        ]
+        assert reader.counts == {"/notes": 14}
+        assert reader.unlisted == ["bag_3.mcap"]

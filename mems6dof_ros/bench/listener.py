@@ -23,6 +23,8 @@ class ListenerNode(InstrumentNode):
     def __init__(self) -> None:
         super().__init__("localizer", ())
         self._info: FrameInfo | None = None
+
+    def activate(self) -> None:
         self._answers = self.create_publisher(Localizations, topics.LOCALIZATIONS, transport.MESSAGES)
         self.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES)
         self.create_subscription(Image, topics.IMAGE, self._on_image, transport.FRAMES)

@@ -15,17 +15,17 @@ from typing import Any
 import rclpy
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.health import Health
-from mems6dof_ros.nodes.parameters import Parameter, declare
-from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT, Worker
+from mems6dof_ros.nodes.lifecycle import ManagedNode
+from mems6dof_ros.nodes.parameters import AUTOSTART, Parameter, declare
+from mems6dof_ros.nodes.worker import Worker
 
 #: Environment variable by which the runner tells a node its process id.
 PARENT_VARIABLE = "MEMS6DOF_PARENT"
@@ -66,26 +66,48 @@ class WhileRoom(CallbackGroup):
         pass
 
 
-class InstrumentNode(Node):
-    """A node with declared parameters, ``values`` by name, ``health``, and perhaps a ``worker``.
+class InstrumentNode(ManagedNode):
+    """A managed node with declared parameters, ``values`` by name, ``health``, and perhaps a ``worker``.
 
     ``finished`` set from any thread ends the process in good order, ``failure`` with its exception.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         super().__init__(name)
-        self.values = declare(self, parameters)
+        self.values = declare(self, (AUTOSTART, *parameters))
         self.health = Health(self)
         self.worker: Worker[Any] | None = None
         self.finished = threading.Event()
         self.failure: BaseException | None = None
+        self._rehearsal: threading.Thread | None = None
+
+    def entered(self, state: str) -> None:
+        self.health.lifecycle = state
+        self.get_logger().info(state)
+        if state != "active":  # what was true then
+            self.health.state = ""
+        if state == "finalized":
+            self.finished.set()
+
+    def hindered(self, error: Exception) -> None:
+        if isinstance(error, (Mems6dofError, OSError)):
+            self.health.refused(f"{self.lifecycle}: {error}")
+        else:
+            self.failure = error  # a defect
+
+    def deactivate(self) -> None:
+        """Finish what is queued; before what else a node does."""
+        if self.worker and (left := self.worker.end()):
+            self.health.lost(left, f"{left} messages left in the queue")
+        self.worker = None
 
     def start_worker(self, work: Callable[[Any], None], capacity: int | None = None) -> Worker[Any]:
-        """The node's worker, with the queue that the parameters describe, or of ``capacity``."""
+        """A worker until the node is deactivated, with the queue that the parameters describe, or of
+        ``capacity``."""
         capacity = capacity or self.values["queue_size"]
         wake = self.create_guard_condition(lambda: None)
         self.worker = Worker(work, capacity, self.values["queue_policy"], wake.trigger)
-        self.health.gauge("queue", self.worker.__len__)
+        self.health.gauge("queue", lambda: len(self.worker or ()))
         return self.worker
 
     def when_ready(
@@ -94,27 +116,28 @@ class InstrumentNode(Node):
         act: Callable[[], None],
         rehearse: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call ``act`` in the executor's thread, once ``waiting_for`` returns nothing to wait for.
+        """Of ``activate``: call ``act`` in the executor's thread, once ``waiting_for`` returns nothing.
 
         Nodes subscribe, or begin to publish, only then, so that readiness travels from the end of the chain
         to its beginning and the first message finds everybody listening. ``rehearse`` runs before, in a
         thread: it computes what nobody sees, so that the first message does not wait for the compiler.
         """
         tell_at, interval = 0.0, 5.0
-        rehearsed = threading.Event()
 
         def compile_kernels() -> None:
             try:
                 rehearse()
             except BaseException as error:  # handed to the main thread, which ends the node
                 self.failure = error
-            rehearsed.set()
 
-        threading.Thread(target=compile_kernels, name="rehearsal", daemon=True).start()
+        if self._rehearsal is None:  # once in a process
+            self._rehearsal = threading.Thread(target=compile_kernels, name="rehearsal", daemon=True)
+            self._rehearsal.start()
 
         def look() -> None:
             nonlocal tell_at, interval
-            if missing := waiting_for() if rehearsed.is_set() else "the compiler":
+            assert self._rehearsal is not None
+            if missing := "the compiler" if self._rehearsal.is_alive() else waiting_for():
                 self.health.state = f"waiting for {missing}"
                 if time.monotonic() > tell_at:
                     self.get_logger().info(self.health.state)
@@ -147,7 +170,7 @@ class InstrumentNode(Node):
         return missing
 
     def tell(self, state: str) -> None:
-        """Note and log the state of the node."""
+        """Note and log what the node does."""
         self.health.state = state
         self.get_logger().info(state)
 
@@ -158,12 +181,9 @@ class InstrumentNode(Node):
             raise failure
 
     def end(self, spin: Callable[[float], None]) -> None:
-        """Finish what is queued and release everything; ``spin(s)`` lets callbacks run meanwhile."""
-        if self.worker and (left := self.worker.end()):
-            self.get_logger().warning(f"{left} messages left in the queue")
-        deadline = time.monotonic() + DRAIN_TIMEOUT
-        for publisher in self.publishers:
-            publisher.wait_for_all_acked(Duration(seconds=max(deadline - time.monotonic(), 0.0)))
+        """Finish what is queued and release everything; ``spin(s)`` lets callbacks run before."""
+        if self.lifecycle != "finalized" and self.trigger_shutdown() != TransitionCallbackReturn.SUCCESS:
+            self.failure = self.failure or self.trouble
 
 
 def required_subscribers(entries: Sequence[str], topics: Collection[str]) -> dict[str, tuple[set[str], int]]:
@@ -206,6 +226,10 @@ def run(create: Callable[[], InstrumentNode], args: list[str] | None = None, *, 
         node = create()
         if warning:
             node.get_logger().warning(warning)
+        if node.values[AUTOSTART.name]:
+            node.bring_up()
+        else:
+            node.get_logger().info("unconfigured: waiting for a lifecycle manager")
         _spin(node, stop)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0

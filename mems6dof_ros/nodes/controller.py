@@ -46,16 +46,20 @@ class ControllerNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("controller", PARAMETERS)
+
+    def configure(self) -> None:
         drive = to_settings(DriveSettings, "drive.", self.values)
         settings = to_settings(ControllerSettings, "", self.values)
         self._controller = Controller(settings, load_law(self.values["law"])(drive))
         self._arrival = math.nan  # of the latest pose
         self._commands = self.create_publisher(ActuationCommand, topics.ACTUATION_COMMAND, transport.MESSAGES)
         self._states = self.create_publisher(ControllerState, topics.CONTROLLER_STATE, ANSWERS)
+
+    def activate(self) -> None:
+        self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_subscription(
             ActuationAcknowledgement, topics.ACTUATION_ACKNOWLEDGEMENT, self._on_acknowledgement, ANSWERS
         )
-        self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(
             _WATCHDOG_PERIOD,
             lambda: self._act(self._controller.on_time(time.time())),
@@ -78,10 +82,10 @@ class ControllerNode(InstrumentNode):
         self.create_subscription(Pose6DOF, topics.POSE_6DOF, self._on_pose, transport.MESSAGES)
         self.tell("idle")
 
-    def end(self, spin: Callable[[float], None]) -> None:
+    def deactivate(self) -> None:
         if self._controller.state is State.MOVING:
             self._act(self._controller.stop("the controller ends"))
-        super().end(spin)
+        super().deactivate()
 
     def _on_pose(self, message: Pose6DOF) -> None:
         if message.body == self.values["body"]:

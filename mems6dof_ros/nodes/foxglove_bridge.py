@@ -39,6 +39,8 @@ class FoxgloveBridgeNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("foxglove_bridge", PARAMETERS)
+
+    def configure(self) -> None:
         try:
             import foxglove
         except ModuleNotFoundError as error:
@@ -59,6 +61,9 @@ class FoxgloveBridgeNode(InstrumentNode):
             self._server = foxglove.start_server(name="mems6dof", host=address, port=port, context=context)
         except (OSError, RuntimeError, ValueError) as error:
             raise InputError(f"address {address}, port {port}", str(error), "both free here") from error
+
+    def activate(self) -> None:
+        address = self.values["address"]
         self._taken: dict[str, Any] = {}
         self.create_timer(_PERIOD, self._follow_viewers, clock=Clock(clock_type=ClockType.STEADY_TIME))
         Snapshots(
@@ -72,9 +77,8 @@ class FoxgloveBridgeNode(InstrumentNode):
         if not is_loopback(address):
             self.get_logger().warning("everybody who reaches this address can see everything")
 
-    def end(self, spin: Callable[[float], None]) -> None:
+    def cleanup(self) -> None:
         self._server.stop()
-        super().end(spin)
 
     def _follow_viewers(self) -> None:
         """Subscribe to what somebody looks at, and to nothing else."""

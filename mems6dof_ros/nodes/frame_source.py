@@ -7,6 +7,9 @@
                    ▼
                  ENDED ──▶ exit, or ~/start to begin again
 
+while the node is active, and nothing is published while it is not; ``~/start`` and ``~/step`` bring it up.
+Deactivated it keeps its place among the frames, cleaned up it closes the source.
+
 Topics (relative): ``frame_info``, ``truth`` where the source knows it, ``camera_info``, and then
 ``image_raw``, all with one header. With ``simulator.commanded`` also those of ``nodes.actuation``.
 """
@@ -26,12 +29,12 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
-from mems6dof_ros.errors import InputError
+from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.actuation import serve_commanded_simulator
 from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
-from mems6dof_ros.nodes.parameters import Parameter, of_settings
+from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter, of_settings
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
@@ -79,7 +82,7 @@ PARAMETERS = (
         "s",
         (0.1, 3600.0),
     ),
-    Parameter("autostart", True, "Begin by itself; otherwise at a call of ~/start."),
+    START_PAUSED,
     Parameter(
         "at_end", "exit", "What to do after the last frame of a finite source.", choices=("exit", "idle")
     ),
@@ -136,34 +139,42 @@ class FrameSourceNode(InstrumentNode):
 
     def __init__(self, name: str = "frame_source", parameters: Sequence[Parameter] = PARAMETERS) -> None:
         super().__init__(name, parameters)
-        self._source = open_source(self.values["source"], **self._options())
         self._changed = threading.Condition()
         self._state = State.WAITING
-        self._steps = 0
-        self._abandon = False
         self._in_flight: dict[int, float] = {}  # stamp in ns: when published, monotonic s
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_service(Trigger, "~/step", self._on_step)
+        self.health.gauge("frames in flight", lambda: len(self._in_flight))
 
+    def configure(self) -> None:
+        self._source = open_source(self.values["source"], **self._options())
+        info = self._source.info
+        self.get_logger().info(
+            f"{info.kind}: {info.width} x {info.height} px {info.encoding},"
+            f" {'no end' if info.frames is None else f'{info.frames} frames'}"
+        )
+        self._state = State.WAITING
+        self._begin_as = State.STOPPED if self.values["start_paused"] else State.RUNNING
+        self._steps = 0
+        self._playing = False  # the source has been started and has not ended
+        self._held: Frame | None = None  # read, but not yet published
         self._topics: dict[str, Publisher] = {
             topics.IMAGE: self.create_publisher(Image, topics.IMAGE, transport.FRAMES),
             topics.FRAME_INFO: self.create_publisher(FrameInfo, topics.FRAME_INFO, transport.MESSAGES),
             topics.CAMERA_INFO: self.create_publisher(CameraInfo, topics.CAMERA_INFO, transport.MESSAGES),
             topics.TRUTH: self.create_publisher(GroundTruth, topics.TRUTH, transport.MESSAGES),
         }
+
+    def activate(self) -> None:
         if self.values["pacing"] == "consumer":
             topic = self.values["acknowledged_by"]
             kind = ACKNOWLEDGING[topic]
             self.create_subscription(kind, topic, self._on_acknowledged, transport.MESSAGES, raw=True)
-        self.create_service(Trigger, "~/start", self._on_start)
-        self.create_service(Trigger, "~/stop", self._on_stop)
-        self.create_service(Trigger, "~/step", self._on_step)
         if isinstance(self._source, CommandedSimulator):
             serve_commanded_simulator(self, self._source)
-        self.health.gauge("frames in flight", lambda: len(self._in_flight))
-        info = self._source.info
-        self.get_logger().info(
-            f"{info.kind}: {info.width} x {info.height} px {info.encoding},"
-            f" {'no end' if info.frames is None else f'{info.frames} frames'}"
-        )
+        self._abandon = False
+        self._in_flight.clear()
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
         self._begin_when_ready()
 
@@ -171,14 +182,20 @@ class FrameSourceNode(InstrumentNode):
         """Begin when everybody listens."""
         self.when_ready(self.missing_subscribers(self._topics), self._thread.start)
 
-    def end(self, spin: Callable[[float], None]) -> None:
+    def deactivate(self) -> None:
         with self._changed:
             self._abandon = True
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(DRAIN_TIMEOUT)
+        if self._thread.is_alive():
+            raise Mems6dofError(f"the source {self.values['source']} does not let go")
+        if self._state in (State.RUNNING, State.STOPPED):
+            self._begin_as, self._state = self._state, State.WAITING
+        super().deactivate()
+
+    def cleanup(self) -> None:
         self._source.stop()
-        super().end(spin)
         self.get_logger().info(
             f"{self.health.total('frames')} frames published, {self.health.total('refused')} refused,"
             f" {self.health.total('lost')} lost"
@@ -200,22 +217,25 @@ class FrameSourceNode(InstrumentNode):
 
     def _run(self) -> None:
         try:
-            self._set_state(State.RUNNING if self.values["autostart"] else State.STOPPED)
+            if self._state is State.WAITING:
+                self._set_state(self._begin_as)
             while self._wait_until_wanted():
                 self._play()
-                if self.values["at_end"] == "exit":
+                if self._state is State.ENDED and self.values["at_end"] == "exit":
                     self.finished.set()
                     return
         except BaseException as error:  # handed to the main thread, which ends the node
             self.failure = error
 
     def _play(self) -> None:
-        """Publish the source from its first frame to its last."""
-        self._source.start()
+        """Publish the source from its first frame, or from where it was left, to its last."""
+        if not self._playing:
+            self._source.start()
+            self._playing = True
         due = time.monotonic()
         while self._wait_until_wanted():
             try:
-                frame = self._source.read(timeout=1.0)
+                frame = self._held or self._source.read(timeout=1.0)
             except TimeoutError:
                 self.health.state = "the source delivers no frames"
                 continue
@@ -224,12 +244,17 @@ class FrameSourceNode(InstrumentNode):
                 continue
             if frame is None:
                 break
+            self._held = frame
             due = self._wait_for_turn(due)
             if self._abandon:
                 return
+            self._held = None
             self._deliver(frame)
             with self._changed:
                 self._steps = max(self._steps - 1, 0)
+        else:
+            return
+        self._playing = False
         self._wait_for_consumer(0)
         self._set_state(State.ENDED)
 
@@ -318,22 +343,29 @@ class FrameSourceNode(InstrumentNode):
         return self._answer(response, State.RUNNING)
 
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self.lifecycle != "active":
+            response.success, response.message = False, self.lifecycle
+            return response
         return self._answer(response, State.STOPPED)
 
     def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        with self._changed:
-            self._steps += 1
-        return self._answer(response, State.STOPPED)
+        return self._answer(response, State.STOPPED, steps=1)
 
-    def _answer(self, response: Trigger.Response, state: State) -> Trigger.Response:
+    def _answer(self, response: Trigger.Response, state: State, steps: int = 0) -> Trigger.Response:
         """Change to ``state`` where there is still something to publish."""
-        if self._state is State.WAITING:
-            response.success, response.message = False, self.health.state
+        try:
+            self.bring_up()
+        except Mems6dofError as error:
+            response.success, response.message = False, str(error)
             return response
         if self._state is State.ENDED and state is State.STOPPED:
             response.success, response.message = False, "all frames have been published: start begins again"
             return response
-        self._set_state(state)
+        with self._changed:
+            self._steps += steps
+            self._begin_as = state
+        if self._state is not State.WAITING:
+            self._set_state(state)
         response.success, response.message = True, self.health.state
         return response
 

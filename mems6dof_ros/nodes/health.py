@@ -26,7 +26,8 @@ class Health:
     MOST_LINES = 10  # that are logged of the problems of one period
 
     def __init__(self, node: Node) -> None:
-        self.state = "starting"
+        self.lifecycle = "unconfigured"  # label of the state of a managed node
+        self.state = ""  # what it does there
         self._node = node
         self._lock = threading.Lock()
         self._totals: dict[str, int] = defaultdict(int)
@@ -103,7 +104,9 @@ class Health:
         if (more := len(problems) - self.MOST_LINES) > 0:
             self._node.get_logger().warning(f"and {more} more problems in the last second")
         values.update({what: str(read()) for what, read in self._gauges.items()})
-        level, message = max(problems, default=(DiagnosticStatus.OK, self.state), key=lambda p: p[0])
+        values["lifecycle"] = self.lifecycle
+        state = f"{self.lifecycle}: {self.state}" if self.state else self.lifecycle
+        level, message = max(problems, default=(DiagnosticStatus.OK, state), key=lambda p: p[0])
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name().lstrip("/"),

@@ -64,7 +64,8 @@ _TRACKING = {
     "detection_period": ("frames", "The whole frame is searched every so many frames."),
     "least_found": ("1", "Fraction of the expected good fits below which a frame is searched at once."),
 }
-_CAMERA = {
+#: Parameters that tell the noise of a camera: name to (unit, meaning).
+CAMERA_NOISE = {
     "offset_adu": ("ADU", "Pixel value without light"),
     "gain_adu_per_electron": ("ADU/electron", "Gain"),
     "read_noise_electrons": ("electrons", "Standard deviation of what is not photon noise"),
@@ -83,7 +84,7 @@ PARAMETERS = (
     WAIT_PARAMETER,
     *(
         Parameter(f"camera.{name}", NAN, f"{doc}, in place of the calibration's.", unit, optional=True)
-        for name, (unit, doc) in _CAMERA.items()
+        for name, (unit, doc) in CAMERA_NOISE.items()
     ),
     *of_settings(LocalizerSettings, "", _SETTINGS),
     *of_settings(DetectionSettings, "detection.", _DETECTION),
@@ -144,11 +145,15 @@ class LocalizerNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("localizer", PARAMETERS)
+
+    def configure(self) -> None:
         self._output = LocalizationOutput(self)
-        self._matcher = FrameMatcher()
         self._last = -1, -1  # frame counter and cycle of the frame before
-        self._dropped = 0
+
+    def activate(self) -> None:
+        self._matcher = FrameMatcher()
         self._poses: deque[CyclePose] = deque(maxlen=16)
+        self._dropped = 0
         self.start_worker(self._localize)
         if self._output.tracker:
             self.create_subscription(Pose6DOF, topics.POSE_6DOF, self._on_pose, transport.MESSAGES)
@@ -237,10 +242,12 @@ def make_localizer(values: Mapping[str, Any]) -> Localizer:
     """The localizer that the parameters describe; InputError where they cannot work together."""
     path, method = values["calibration"], values["method"]
     calibration = load_calibration(path, method or None) if path else None
-    given = {name: values[f"camera.{name}"] for name in _CAMERA if not math.isnan(values[f"camera.{name}"])}
+    given = {
+        name: values[f"camera.{name}"] for name in CAMERA_NOISE if not math.isnan(values[f"camera.{name}"])
+    }
     if calibration:
         camera = replace(calibration.camera, **given)
-    elif missing := [name for name in _CAMERA if name not in given]:
+    elif missing := [name for name in CAMERA_NOISE if name not in given]:
         raise InputError(
             f"parameter camera.{missing[0]}", "neither a value nor a calibration", "one of the two"
         )

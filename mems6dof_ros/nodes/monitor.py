@@ -85,6 +85,8 @@ class MonitorNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("monitor", PARAMETERS)
+
+    def configure(self) -> None:
         self._feed = Feed(self.values["history"], log=lambda text: self._warn(f"alarm: {text}"))
         self._server = MonitorServer(
             self._feed,
@@ -107,8 +109,14 @@ class MonitorNode(InstrumentNode):
         self._found: _Recent[int, bytes] = _Recent()
         self._infos: _Recent[int, FrameInfo] = _Recent()
         self._images: Queue[bytes | None] = Queue(maxsize=1)
+        self._triggers = {name: self.create_client(Trigger, name) for name in SERVICES}
         self._painter = threading.Thread(target=self._paint, name="painter", daemon=True)
+        # Printed, not logged: the address may hold a token, and logs and diagnostics are published.
+        print(f"live page: {self._server.start()}", flush=True)
+        self._painter.start()
+        self.health.gauge("pages with pictures", lambda: self._feed.watchers)
 
+    def activate(self) -> None:
         def subscribe(kind: type, topic: str, callback: Callable[..., None], raw: bool = False) -> None:
             self.create_subscription(kind, topic, callback, transport.MESSAGES, raw=raw)
 
@@ -119,24 +127,17 @@ class MonitorNode(InstrumentNode):
         subscribe(Localizations, topics.LOCALIZATIONS, self._on_localizations, raw=True)
         subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics)
-        self._triggers = {name: self.create_client(Trigger, name) for name in SERVICES}
         # Wall time: the page lives also while simulated time stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_STATE_PERIOD, self._tell_state, clock=steady)
         if rate := self.values["picture_rate"]:
             Snapshots(self, topics.IMAGE, rate, self._wants_image, self._images.put)
-
-        self._painter.start()
-        # Printed, not logged: the address may hold a token, and logs and diagnostics are published.
-        print(f"live page: {self._server.start()}", flush=True)
         self.tell("serving")
-        self.health.gauge("pages with pictures", lambda: self._feed.watchers)
 
-    def end(self, spin: Callable[[float], None]) -> None:
+    def cleanup(self) -> None:
         self._server.stop()
         self._images.put(None)
         self._painter.join(timeout=2)
-        super().end(spin)
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)

@@ -46,9 +46,12 @@ class PipelineNode(frame_source.FrameSourceNode):
     def __init__(self) -> None:
         super().__init__("pipeline", PARAMETERS)
 
-    def _begin_when_ready(self) -> None:
+    def configure(self) -> None:
         self._localization = localizer.LocalizationOutput(self)
         self._pose = pose_estimator.PoseOutput(self)
+        super().configure()
+
+    def _begin_when_ready(self) -> None:
         publishers = {
             **self._topics,
             topics.LOCALIZATIONS: self._localization.publisher,

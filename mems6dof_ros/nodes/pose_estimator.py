@@ -149,7 +149,11 @@ class PoseEstimatorNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("pose_estimator", PARAMETERS)
+
+    def configure(self) -> None:
         self._output = PoseOutput(self)
+
+    def activate(self) -> None:
         self.start_worker(self._estimate)
         missing = self.missing_subscribers(self._output.publishers)
         self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.settings))

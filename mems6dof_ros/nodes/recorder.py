@@ -1,7 +1,7 @@
 """``recorder``: topics to a bag (rosbag2, MCAP) as they come over the wire, without decoding them.
 
-Services (std_srvs/Trigger): ``~/start`` begins a new bag, ``~/stop`` completes it. What a publisher had
-sent before the node was told to end is still written.
+Services (std_srvs/Trigger): ``~/start`` begins a new bag, and brings the node up if need be, ``~/stop``
+completes it, as deactivation does. What a publisher had sent before the node was told to end is still written.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from mems6dof_ros.errors import InputError
+from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import InstrumentNode, WhileRoom, run
-from mems6dof_ros.nodes.parameters import Parameter
+from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import COMPRESSIONS, BagWriter, Channel, Qos
@@ -64,7 +64,7 @@ PARAMETERS = (
     ),
     Parameter("sync_period", 1.0, "What is older survives a loss of power.", "s", (0.01, 3600.0)),
     Parameter("attachments", (), "Files to attach to the bag, for instance the calibration."),
-    Parameter("autostart", True, "Begin to record by itself; otherwise at a call of ~/start."),
+    START_PAUSED,
     Parameter("queue_mebibytes", 512, "Messages that wait for the disk.", "MiB", (1, 1_000_000)),
     Parameter(
         "queue_policy",
@@ -93,17 +93,21 @@ class RecorderNode(InstrumentNode):
         self._bags = 0
         self._flushed = 0.0
         self._sequences: dict[str, int] = {}
-        self._dropped = 0
-        for path in self.values["attachments"]:
-            if not Path(path).is_file():
-                raise InputError("parameter attachments", f"no file '{path}'", "existing files")
-        if self.values["autostart"]:
-            self._open()
-        capacity = self.values["queue_mebibytes"] * 2**20
-        self.start_worker(lambda act: act(), capacity)
         self.create_service(Trigger, "~/start", self._on_start)
         # In a group of its own: it waits for messages that come meanwhile.
         self.create_service(Trigger, "~/stop", self._on_stop, callback_group=MutuallyExclusiveCallbackGroup())
+
+    def configure(self) -> None:
+        for path in self.values["attachments"]:
+            if not Path(path).is_file():
+                raise InputError("parameter attachments", f"no file '{path}'", "existing files")
+
+    def activate(self) -> None:
+        if not self.values["start_paused"]:
+            self._open()
+        self._dropped = 0
+        capacity = self.values["queue_mebibytes"] * 2**20
+        self.start_worker(lambda act: act(), capacity)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._unknown = [name for name in self.values["topics"] if not self._subscribe_known(name)]
         if self._unknown:
@@ -111,16 +115,19 @@ class RecorderNode(InstrumentNode):
         self.create_timer(1.0, self._on_second, clock=steady)
         self.tell("recording" if self._bag else "stopped")
 
+    def deactivate(self) -> None:
+        assert self.worker is not None
+        self.worker.end(timeout=None)  # a slow disk is no reason to lose a record; a second signal is
+        super().deactivate()
+        self._close()
+
     def end(self, spin: Callable[[float], None]) -> None:
         deadline = time.monotonic() + DRAIN_TIMEOUT
         before = -1
         while before != self.health.total("messages") and time.monotonic() < deadline:
             before = self.health.total("messages")
             spin(_QUIET)
-        assert self.worker is not None
-        self.worker.end(timeout=None)  # a slow disk is no reason to lose a record; a second signal is
         super().end(spin)
-        self._close()
 
     # Topics -------------------------------------------------------------------------------------
 
@@ -258,8 +265,10 @@ class RecorderNode(InstrumentNode):
             response.success, response.message = False, f"already recording to {self._bag.path}"
             return response
         try:
-            self._open()
-        except (InputError, OSError) as error:
+            self.bring_up()
+            if self._bag is None:
+                self._open()
+        except (Mems6dofError, OSError) as error:
             response.success, response.message = False, str(error)
             return response
         assert self._bag is not None
@@ -268,7 +277,6 @@ class RecorderNode(InstrumentNode):
         return response
 
     async def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        assert self.worker is not None
         if not self._bag:
             response.success, response.message = False, "not recording"
             return response
@@ -280,6 +288,9 @@ class RecorderNode(InstrumentNode):
             self._close()
             closed.set()
 
+        if self.worker is None:  # deactivated meanwhile, which has closed it
+            response.success, response.message = True, str(path)
+            return response
         self.worker.put(close)  # behind what is queued
         response.success = closed.wait(DRAIN_TIMEOUT)
         response.message = str(path) if response.success else f"{path}: the disk is behind, still writing"

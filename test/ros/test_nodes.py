@@ -297,7 +297,7 @@ def test_start_stop_and_step(start: Start, peer: Peer) -> None:
     peer.listen(Image, "image_raw")
     node = start(
         "frame_source",
-        *parameters(*SMALL, "simulator.cycles:=3", "autostart:=false", "at_end:=idle", "rate:=1000.0"),
+        *parameters(*SMALL, "simulator.cycles:=3", "start_paused:=true", "at_end:=idle", "rate:=1000.0"),
     )
     node.wait_for_line("stopped")
     images = peer.received["image_raw"]
@@ -359,7 +359,7 @@ def test_recorder_starts_stops_and_learns_types(start: Start, peer: Peer, tmp_pa
     output = tmp_path / "bag"
     node = start(
         "recorder",
-        *parameters(f"output:={output}", "topics:=[notes, pose_6dof]", "autostart:=false"),
+        *parameters(f"output:={output}", "topics:=[notes, pose_6dof]", "start_paused:=true"),
     )
     node.wait_for_line("stopped")
     notes, poses = peer.publisher(String, "notes"), peer.publisher(Pose6DOF, "pose_6dof")

@@ -18,7 +18,7 @@ import yaml
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.frame_matcher import FrameMatcher
-from mems6dof_ros.nodes.parameters import NODES, Parameter, as_yaml, config_text
+from mems6dof_ros.nodes.parameters import AUTOSTART, NODES, Parameter, as_yaml, config_text
 from mems6dof_ros.nodes.system import SYSTEMS
 from mems6dof_ros.nodes.worker import Worker
 from mems6dof_ros.recording import messages
@@ -33,7 +33,7 @@ def test_parameter_files_are_up_to_date(name: str) -> None:
     """``make config`` writes them; every declared parameter appears, with its default, and no other."""
     text = (ROOT / "config" / f"{name}.yaml").read_text()
     assert text == config_text(name)
-    declared = importlib.import_module(f"mems6dof_ros.nodes.{name}").PARAMETERS
+    declared = (AUTOSTART, *importlib.import_module(f"mems6dof_ros.nodes.{name}").PARAMETERS)
     assert all(parameter.doc for parameter in declared)
     written = _flat(yaml.safe_load(text)["/**"]["ros__parameters"])
     assert set(written) == {parameter.name for parameter in declared}

@@ -180,7 +180,7 @@ def test_nodes_do_not_survive_a_killed_runner(tmp_path: Path) -> None:
     script.write_text(
         "import json, time\n"
         "from mems6dof_ros.nodes.system import NodeSpec, run_system\n"
-        "nodes = [NodeSpec('pose_estimator'), NodeSpec('recorder', {'autostart': False})]\n"
+        "nodes = [NodeSpec('pose_estimator'), NodeSpec('recorder', {'start_paused': True})]\n"
         "with run_system(nodes) as system:\n"
         "    print(json.dumps([p.pid for p in system.processes.values()]), flush=True)\n"
         "    time.sleep(600)\n"

@@ -6,7 +6,7 @@ All kernels release the GIL (threads over frames) and are cached on disk. Argume
 name           shape, type         content
 =============  ==================  =====================================================================
 image          (h, w) u1 or u2     pixels, ADU
-starts         (n, 2)              positions: column and row, px
+starts         (n, 7)              x, y, A, sigma_x, sigma_y, rho, B as in parameters; A NaN: only x, y known
 offset         (h, w) or (1, 1)    ADU
 gain           (h, w) or (1, 1)    ADU per electron
 read_variance  (h, w) or (1, 1)    electrons^2
@@ -19,15 +19,16 @@ covariance     (n, 7, 7)           out
 quality        (n, 4)              out: reduced chi-square, iterations, lines cut off, 1 if saturated
 =============  ==================  =====================================================================
 
-Inside, a window is flat, each row padded to a multiple of LANES so that every loop runs in whole
-vectors; padding has weight 0. The parameters are iterated as ``theta = (x, y, A, ln sigma_x,
-ln sigma_y, atanh rho, B)`` relative to the window's central pixel, which keeps widths positive and
-``|rho| < 1`` without constraints.
+Inside, a window is flat, each row padded to a multiple of LANES; padding has weight 0. The parameters are
+iterated as ``theta = (x, y, A, ln sigma_x, ln sigma_y, atanh rho, B)`` relative to the window's central
+pixel, which keeps widths positive and ``|rho| < 1`` without constraints.
 
 Where the speed comes from. The exponent is quadratic, so that E of the next row is E times a ratio
 which itself changes by a constant factor: two products per pixel instead of an exponential. Every
 derivative is E times a quadratic polynomial (or 1 for the background): J'WJ and J'Wr follow from 22 + 7
-weighted moments and a 7 x 7 transformation per window.
+weighted moments and a 7 x 7 transformation per window. One pass over the pixels, eight columns at a time,
+does all of it: E, model, weights, objective, and the sums over each column's rows from which the moments
+follow, in registers.
 """
 
 from __future__ import annotations
@@ -39,9 +40,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-UNIFORM, RELATIVE, LIGHT, POISSON = 0, 1, 2, 3
+from mems6dof_ros.localization.vectors import LANES, largest, load, log, splat, store, total, where_positive
 
-LANES = 8
+UNIFORM, RELATIVE, LIGHT, POISSON = 0, 1, 2, 3
+# What a pass over the pixels is for: to minimise with fixed weights, or with those that LIGHT and POISSON
+# have at the present parameters, or to find one of the parts of the uncertainty.
+FIXED, INFORMATION, SCATTER, BENT = 1, 4, 5, 6
+
+LEAST_SHAPE = 1e-150
 VARIANCE_FLOOR = 0.01  # electrons^2, as in gaussian.py
 LEAST_SIGMA = 0.7  # px; with LARGEST_ATANH and windows to 65 px no exponential overflows
 LARGEST_ATANH = 1.8  # rho = 0.947
@@ -67,140 +73,180 @@ def pixels(image: Image) -> Image:
     return view
 
 
+# Every window has ``field`` (4, size), of each pixel: electrons; variance of the read noise; how much of it
+# counts; weights of the fit where they are fixed. And ``columns`` (23, stride), of each column: the
+# factors by column and row of what counts; E in the central row, and its ratios to the rows below and above;
+# the sums of ``_evaluate``; the powers 0 to 4 of u. Few arrays, since each costs at every call.
+DATA, READ, VALID, WEIGHTS = 0, 1, 2, 3
+PART, CENTRE, DOWN, UP, SUMS, POWERS = 0, 2, 3, 4, 5, 18
+_FIELDS, _COLUMNS = 4, 23
+
+
+# Passes over the pixels ------------------------------------------------------------------------------
+
+
 @njit(fastmath=_FAST, **_OPTIONS)
-def _shape(theta: Array, window: int, stride: int, shape: Array) -> None:
-    """Fill ``shape`` with E, the Gaussian of unit amplitude, outwards from the central pixel."""
-    half = window // 2
+def _central_row(theta: Array, side: int, columns: Array) -> float:
+    """E in the central row, and its ratios to the rows below and above, into ``columns``.
+
+    From row to row either ratio changes by the factor that is returned.
+    """
+    stride, half = columns.shape[1], side // 2
     x, y = theta[0], theta[1]
     rho = math.tanh(theta[5])
     k = 1 / (1 - rho * rho)
     sx, sy = math.exp(theta[3]), math.exp(theta[4])
     a, b, c = k / (sx * sx), -k * rho / (sx * sy), k / (sy * sy)
-    # Central row, both ways at once. E(u+1)/E(u) is a ratio that changes by exp(-a) per column;
-    # exp(-b u) is what a row's ratio to the next one has of the column.
+    # Both ways at once. E(u+1)/E(u) is a ratio that changes by exp(-a) per column; exp(-b u) is what a
+    # row's ratio to the next one has of the column.
     curve, turn, back = math.exp(-a), math.exp(-b), math.exp(b)
     right_ratio, left_ratio = math.exp(a * x - 0.5 * a + b * y), math.exp(-a * x - 0.5 * a - b * y)
     right = left = math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y))
     right_turn = left_turn = math.exp(b * x)
-    row = half * stride
-    down, up = np.empty(stride), np.empty(stride)
-    shape[row + half], down[half] = right, right_turn
+    columns[CENTRE, half], columns[DOWN, half] = right, right_turn
     for j in range(1, stride - half):
         right *= right_ratio
         right_ratio *= curve
         right_turn *= turn
-        shape[row + half + j], down[half + j] = right, right_turn
+        columns[CENTRE, half + j], columns[DOWN, half + j] = right, right_turn
         if j <= half:
             left *= left_ratio
             left_ratio *= curve
             left_turn *= back
-            shape[row + half - j], down[half - j] = left, left_turn
-    # From row to row, likewise.
-    curve = math.exp(-c)
+            columns[CENTRE, half - j], columns[DOWN, half - j] = left, left_turn
     down_ratio, up_ratio = math.exp(c * y - 0.5 * c), math.exp(-c * y - 0.5 * c)
-    for j in range(stride):
-        up[j] = up_ratio / down[j]
-        down[j] *= down_ratio
-    for i in range(1, half + 1):
-        # Slices: the compiler sees that what is written is not what is read, and uses vectors.
-        below, above = row + i * stride, row - i * stride
-        line, last = shape[below : below + stride], shape[below - stride : below]
-        for j in range(stride):
-            line[j] = last[j] * down[j]
-            down[j] *= curve
-        line, last = shape[above : above + stride], shape[above + stride : above + 2 * stride]
-        for j in range(stride):
-            line[j] = last[j] * up[j]
-            up[j] *= curve
+    for j in range(0, stride, LANES):
+        turns = load(columns, DOWN, j)
+        store(columns, DOWN, j, turns * down_ratio)
+        store(columns, UP, j, up_ratio / turns)
+    return math.exp(-c)
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
-def _weigh(
-    theta: Array,
-    data: Array,
-    noise: Array,
-    valid: Array,
-    shape: Array,
-    weighting: int,
-    weights: Array,
-    pulls: Array,
-) -> float:
-    """Second and first derivatives of the objective's half by the model: ``weights``, ``pulls``.
+@njit(forceinline=True, **_OPTIONS)
+def _floored(variance: Any) -> Any:
+    return where_positive(variance - VARIANCE_FLOOR, variance, splat(VARIANCE_FLOOR))
 
-    ``noise``: the weights themselves where they are fixed (UNIFORM, RELATIVE), else the variance of the
-    read noise. Returns the objective. Light-weighting differentiates the variance too where the model is
-    the greater: with it frozen, steps and acceptance test disagree and fits do not converge.
+
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
+def _weigh(kind: int, shape: Any, field: Array, k: int, amplitude: float, background: float) -> Any:
+    """Of eight pixels from ``k`` on: second and first derivatives by the model of half the objective, and the
+    objective.
+
+    Light-weighting differentiates the variance too where the model is the greater: with it frozen,
+    steps and acceptance test disagree and fits do not converge.
     """
-    amplitude, background = theta[2], theta[6]
-    total = 0.0
-    if weighting in (UNIFORM, RELATIVE):
-        for k in range(data.size):
-            r = data[k] - (amplitude * shape[k] + background)
-            weights[k] = noise[k]
-            pulls[k] = noise[k] * r
-            total += pulls[k] * r
-    elif weighting == POISSON:
-        for k in range(data.size):
-            if valid[k] > 0:
-                mean = max(amplitude * shape[k] + background + noise[k], VARIANCE_FLOOR)
-                count = max(data[k] + noise[k], VARIANCE_FLOOR)
-                weights[k] = valid[k] / mean
-                pulls[k] = valid[k] * (count / mean - 1)
-                total += 2 * valid[k] * (mean - count - count * math.log(mean / count))
-            else:
-                weights[k] = 0.0
-                pulls[k] = 0.0
-    else:
-        for k in range(data.size):
-            model = amplitude * shape[k] + background
-            r = data[k] - model
-            greater = data[k] if r > 0 else model
-            variance = greater + noise[k]
-            variance = variance if variance > VARIANCE_FLOOR else VARIANCE_FLOOR
-            chi = r / variance
-            renewed = 1.0 if r > 0 else 1 + 0.5 * chi
-            weights[k] = valid[k] * renewed * renewed / variance
-            pulls[k] = valid[k] * chi * renewed
-            total += valid[k] * r * chi
-    return total
+    model = shape * amplitude + background
+    count = load(field, DATA, k)
+    r = count - model
+    if kind == FIXED:
+        weight = load(field, WEIGHTS, k)
+        pull = weight * r
+        return weight, pull, pull * r
+    inside, noise = load(field, VALID, k), load(field, READ, k)
+    if kind == LIGHT:
+        inverse = 1.0 / _floored(where_positive(r, count, model) + noise)
+        renewed = where_positive(r, splat(1.0), r * inverse * 0.5 + 1.0)
+        weight = inside * inverse * renewed
+        pull = weight * r
+        return weight * renewed, pull, inside * inverse * r * r
+    if kind == POISSON:
+        mean, count = _floored(model + noise), _floored(count + noise)
+        ratio = count / mean
+        return inside / mean, inside * (ratio - 1.0), inside * (mean - count + count * log(ratio)) * 2.0
+    weight, variance = load(field, WEIGHTS, k), _floored(model + noise)
+    if kind == INFORMATION:
+        return weight, weight * r, inside * r * r / variance
+    if kind == SCATTER:
+        return weight * weight * variance, splat(0.0), splat(0.0)
+    # BENT: _evaluate multiplies it by E^2.
+    return weight * r / where_positive(shape - LEAST_SHAPE, shape, splat(LEAST_SHAPE)), splat(0.0), splat(0.0)
 
 
 @njit(fastmath=_FAST, **_OPTIONS)
-def _moments(shape: Array, u: Array, v: Array, weights: Array, moments: Array) -> None:
+def _evaluate(kind: int, theta: Array, side: int, field: Array, columns: Array) -> float:
+    """The objective; and in ``columns``, for each column, sums over its rows of
+
+    w E^2 v^0...4, w E v^0...2, w, p E v^0...2, p
+
+    with the weights w and pulls p of ``_weigh``. Rows go outwards from the central one, two at a time.
+    """
+    stride, half = columns.shape[1], side // 2
+    amplitude, background = theta[2], theta[6]
+    curve = splat(_central_row(theta, side, columns))
+    objective = splat(0.0)
+    for j in range(0, stride, LANES):
+        k = half * stride + j
+        below = above = load(columns, CENTRE, j)
+        down, up = load(columns, DOWN, j), load(columns, UP, j)
+        w, p, loss = _weigh(kind, below, field, k, amplitude, background)
+        objective += loss
+        w0, t0, p0, q0 = w, w * below, p, p * below
+        s0 = t0 * below
+        s1 = s2 = s3 = s4 = t1 = t2 = q1 = q2 = splat(0.0)
+        for i in range(1, half + 1):
+            v, vv = float(i), float(i * i)
+            below *= down
+            down *= curve
+            k = (half + i) * stride + j
+            w, p, loss = _weigh(kind, below, field, k, amplitude, background)
+            above *= up
+            up *= curve
+            k = (half - i) * stride + j
+            w_up, p_up, loss_up = _weigh(kind, above, field, k, amplitude, background)
+            objective += loss + loss_up
+            w0 += w + w_up
+            p0 += p + p_up
+            t, t_up = w * below, w_up * above
+            s, s_up = t * below, t_up * above
+            q, q_up = p * below, p_up * above
+            even, odd = s + s_up, (s - s_up) * v
+            s0 += even
+            s1 += odd
+            s2 += even * vv
+            s3 += odd * vv
+            s4 += even * (vv * vv)
+            even = t + t_up
+            t0 += even
+            t1 += (t - t_up) * v
+            t2 += even * vv
+            even = q + q_up
+            q0 += even
+            q1 += (q - q_up) * v
+            q2 += even * vv
+        m = SUMS
+        for column in (s0, s1, s2, s3, s4, t0, t1, t2, w0, q0, q1, q2, p0):
+            store(columns, m, j, column)
+            m += 1
+    return total(objective)
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _sum(columns: Array, which: int, power: int) -> float:
+    """One of the sums of ``_evaluate`` times a power of u, over the columns."""
+    result = splat(0.0)
+    for j in range(0, columns.shape[1], LANES):
+        result += load(columns, SUMS + which, j) * load(columns, POWERS + power, j)
+    return total(result)
+
+
+@njit(**_OPTIONS)
+def _moments(columns: Array, moments: Array) -> None:
     """The 7 x 7 weighted products of (E, E u, E v, E u^2, E u v, E v^2, 1) from their 22 moments."""
-    s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = 0.0
-    s40 = s31 = s22 = s13 = s04 = 0.0
-    for k in range(shape.size):
-        f = weights[k] * shape[k] * shape[k]
-        fu, fv = f * u[k], f * v[k]
-        uu, uv, vv = u[k] * u[k], u[k] * v[k], v[k] * v[k]
-        fuu, fuv, fvv = f * uu, f * uv, f * vv
-        s00 += f
-        s10 += fu
-        s01 += fv
-        s20 += fuu
-        s11 += fuv
-        s02 += fvv
-        s30 += fu * uu
-        s21 += fu * uv
-        s12 += fv * uv
-        s03 += fv * vv
-        s40 += fuu * uu
-        s31 += fuu * uv
-        s22 += fuu * vv
-        s13 += fuv * vv
-        s04 += fvv * vv
-    t00 = t10 = t01 = t20 = t11 = t02 = w = 0.0
-    for k in range(shape.size):
-        f = weights[k] * shape[k]
-        fu, fv = f * u[k], f * v[k]
-        t00 += f
-        t10 += fu
-        t01 += fv
-        t20 += fu * u[k]
-        t11 += fu * v[k]
-        t02 += fv * v[k]
-        w += weights[k]
+    s00, s10, s20, s30, s40 = (
+        _sum(columns, 0, 0),
+        _sum(columns, 0, 1),
+        _sum(columns, 0, 2),
+        _sum(columns, 0, 3),
+        _sum(columns, 0, 4),
+    )
+    s01, s11, s21, s31 = _sum(columns, 1, 0), _sum(columns, 1, 1), _sum(columns, 1, 2), _sum(columns, 1, 3)
+    s02, s12, s22 = _sum(columns, 2, 0), _sum(columns, 2, 1), _sum(columns, 2, 2)
+    s03, s13 = _sum(columns, 3, 0), _sum(columns, 3, 1)
+    s04 = _sum(columns, 4, 0)
+    t00, t10, t20 = _sum(columns, 5, 0), _sum(columns, 5, 1), _sum(columns, 5, 2)
+    t01, t11 = _sum(columns, 6, 0), _sum(columns, 6, 1)
+    t02 = _sum(columns, 7, 0)
+    w = _sum(columns, 8, 0)
     moments[0] = (s00, s10, s01, s20, s11, s02, t00)
     moments[1] = (s10, s20, s11, s30, s21, s12, t10)
     moments[2] = (s01, s11, s02, s21, s12, s03, t01)
@@ -210,22 +256,168 @@ def _moments(shape: Array, u: Array, v: Array, weights: Array, moments: Array) -
     moments[6] = (t00, t10, t01, t20, t11, t02, w)
 
 
+@njit(**_OPTIONS)
+def _gradient(columns: Array, gradient: Array) -> None:
+    """The seven products of the same functions with the pulls."""
+    gradient[0], gradient[1], gradient[3] = _sum(columns, 9, 0), _sum(columns, 9, 1), _sum(columns, 9, 2)
+    gradient[2], gradient[4], gradient[5] = _sum(columns, 10, 0), _sum(columns, 10, 1), _sum(columns, 11, 0)
+    gradient[6] = _sum(columns, 12, 0)
+
+
 @njit(fastmath=_FAST, **_OPTIONS)
-def _gradient(shape: Array, u: Array, v: Array, pulls: Array, gradient: Array) -> None:
-    """The seven products of the same functions with ``pulls``."""
-    t00 = t10 = t01 = t20 = t11 = t02 = w = 0.0
-    for k in range(shape.size):
-        f = pulls[k] * shape[k]
-        fu, fv = f * u[k], f * v[k]
-        t00 += f
-        t10 += fu
-        t01 += fv
-        t20 += fu * u[k]
-        t11 += fu * v[k]
-        t02 += fv * v[k]
-        w += pulls[k]
-    gradient[0], gradient[1], gradient[2] = t00, t10, t01
-    gradient[3], gradient[4], gradient[5], gradient[6] = t20, t11, t02, w
+def _fix_weights(relative: bool, kappa: float, theta: Array, side: int, field: Array, columns: Array) -> None:
+    """Weights: valid / (E + kappa), else valid / (variance of the model and the read noise)."""
+    stride, half = columns.shape[1], side // 2
+    amplitude, background = theta[2], theta[6]
+    curve = splat(_central_row(theta, side, columns))
+    for j in range(0, stride, LANES):
+        for way in (1, -1):
+            shape, ratio = load(columns, CENTRE, j), load(columns, DOWN if way > 0 else UP, j)
+            for i in range(half + 1):
+                k = (half + way * i) * stride + j
+                if relative:
+                    variance = shape + kappa
+                else:
+                    variance = _floored(shape * amplitude + background + load(field, READ, k))
+                store(field, WEIGHTS, k, load(field, VALID, k) / variance)
+                shape *= ratio
+                ratio *= curve
+
+
+# Windows ---------------------------------------------------------------------------------------------
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _read_window(
+    image: Image,
+    column: int,
+    row: int,
+    offset: Array,
+    gain: Array,
+    read_variance: Array,
+    side: int,
+    field: Array,
+    columns: Array,
+) -> tuple[int, float]:
+    """Electrons and read noise of the window about a pixel, and what of it lies inside the image.
+
+    Returns the lines cut off at the worst edge and the largest pixel, ADU.
+    """
+    height, width = image.shape
+    stride, half = columns.shape[1], side // 2
+    top, bottom = max(row - half, 0), min(row + half, height - 1)
+    left, right = max(column - half, 0), min(column + half, width - 1)
+    cut = max(max(half - column, half - row), max(column + half - width + 1, row + half - height + 1), 0)
+    for j in range(stride):
+        columns[PART, j] = 1.0 if left <= column - half + j <= right else 0.0
+        columns[PART + 1, j] = 1.0 if top <= row - half + j <= bottom else 0.0
+    maps = offset.size > 1 or gain.size > 1 or read_variance.size > 1
+    least, scale = offset[0, 0], 1 / gain[0, 0]
+    if cut == 0 and side >= LANES and not maps:
+        brightest = splat(0.0)
+        for i in range(side):
+            for j in range(0, side, LANES):
+                j = min(j, side - LANES)  # the last overlaps
+                adu = load(image, row - half + i, column - half + j)
+                brightest = where_positive(adu - brightest, adu, brightest)
+                store(field, DATA, i * stride + j, (adu - least) * scale)
+        return cut, largest(brightest)
+    field[DATA] = 0.0
+    most = 0.0
+    for i in range(top, bottom + 1):
+        k = (i - row + half) * stride - column + half
+        for j in range(left, right + 1):
+            adu = float(image[i, j])
+            most = max(most, adu)
+            o = offset[i, j] if offset.size > 1 else least
+            g = gain[i, j] if gain.size > 1 else gain[0, 0]
+            field[DATA, k + j] = (adu - o) / g
+            field[READ, k + j] = read_variance[i, j] if read_variance.size > 1 else read_variance[0, 0]
+    return cut, most
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _soften(x: float, y: float, side: int, columns: Array) -> None:
+    """Cut what counts to the square of side ``window - 1`` about (x, y), edge pixels by what is inside.
+
+    A window of whole pixels jumps by one as a particle moves; what its edge cuts from the tails of a
+    defocused image then shifts the fit by half a standard deviation and more.
+    """
+    half = side // 2
+    for j in range(columns.shape[1]):
+        columns[PART, j] *= min(max(half + 0.5 - abs(j - half - x), 0.0), 1.0)
+        columns[PART + 1, j] *= min(max(half + 0.5 - abs(j - half - y), 0.0), 1.0)
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _cover(side: int, field: Array, columns: Array) -> float:
+    """How much of each pixel counts, from its factors; returns the sum."""
+    stride = columns.shape[1]
+    wide, high = splat(0.0), 0.0
+    for j in range(0, stride, LANES):
+        wide += load(columns, PART, j)
+    for i in range(side):
+        part = columns[PART + 1, i]
+        high += part
+        for j in range(0, stride, LANES):
+            store(field, VALID, i * stride + j, load(columns, PART, j) * part)
+    return high * total(wide)
+
+
+@njit(fastmath=_FAST_FINITE, **_OPTIONS)
+def _start(window: int, stride: int, field: Array, theta: Array) -> bool:
+    """First parameters from the window alone: border, peak, and moments above 30 % of it.
+
+    A Gaussian cut at the fraction f of its height and lowered by it has 0.358 of its variance
+    (f = 0.3): [1 - f (1 + L) - f L^2 / 2] / [1 - f - f L], L = -ln f. False without contrast.
+    """
+    data, valid = field[DATA], field[VALID]
+    half = window // 2
+    background, count = 0.0, 0.0
+    last = (window - 1) * stride
+    for j in range(window):
+        for k in (j, last + j, j * stride, j * stride + window - 1):
+            background += valid[k] * data[k]
+            count += valid[k]
+    if count == 0:
+        return False
+    background /= count
+    # The peak lies in the inner half: a mean of three pixels, against noise.
+    peak = background
+    for i in range(half // 2, window - half // 2):
+        for k in range(i * stride + half // 2, i * stride + window - half // 2):
+            peak = max(peak, (data[k - 1] + data[k] + data[k + 1]) / 3)
+    level = background + 0.3 * (peak - background)
+    m = mx = my = mxx = mxy = myy = 0.0
+    for i in range(window):
+        v = float(i - half)
+        f0 = fu = fuu = 0.0
+        for j in range(stride):
+            u = float(j - half)
+            f = valid[i * stride + j] * max(data[i * stride + j] - level, 0.0)
+            f0 += f
+            fu += f * u
+            fuu += f * u * u
+        m += f0
+        mx += fu
+        my += f0 * v
+        mxx += fuu
+        mxy += fu * v
+        myy += f0 * v * v
+    if not (peak > background and m > 0):
+        return False
+    x, y = mx / m, my / m
+    vx = max((mxx / m - x * x) / 0.358, 1.0)
+    vy = max((myy / m - y * y) / 0.358, 1.0)
+    rho = (mxy / m - x * y) / 0.358 / math.sqrt(vx * vy)
+    theta[0], theta[1], theta[2] = x, y, peak - background
+    theta[3], theta[4] = 0.5 * math.log(vx), 0.5 * math.log(vy)
+    theta[5] = math.atanh(min(max(rho, -0.7), 0.7))
+    theta[6] = background
+    return True
+
+
+# Algebra of the seven parameters ---------------------------------------------------------------------
 
 
 @njit(**_OPTIONS)
@@ -254,9 +446,8 @@ def _transformation(theta: Array, t: Array) -> None:
 
 
 @njit(**_OPTIONS)
-def _normal(t: Array, moments: Array, normal: Array) -> None:
-    """``normal = t' moments t`` (7, 7)."""
-    half = np.empty((7, 7))
+def _normal(t: Array, moments: Array, half: Array, normal: Array) -> None:
+    """``normal = t' moments t`` (7, 7); ``half``: room for it."""
     for i in range(7):
         for j in range(7):
             s = 0.0
@@ -305,114 +496,6 @@ def _solve(factor: Array, right: Array, solution: Array) -> None:
         solution[i] = s / factor[i, i]
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
-def _read_window(
-    image: Image,
-    column: int,
-    row: int,
-    offset: Array,
-    gain: Array,
-    read_variance: Array,
-    window: int,
-    stride: int,
-    data: Array,
-    read: Array,
-    valid: Array,
-) -> tuple[int, int]:
-    """Electrons of the window about a pixel; what lies outside the image is not valid.
-
-    Returns the lines cut off at the worst edge and the largest pixel, ADU.
-    """
-    height, width = image.shape
-    half = window // 2
-    valid[:] = 0.0
-    data[:] = 0.0
-    read[:] = read_variance[0, 0]
-    top, bottom = max(row - half, 0), min(row + half, height - 1)
-    left, right = max(column - half, 0), min(column + half, width - 1)
-    maps = offset.size > 1 or gain.size > 1 or read_variance.size > 1
-    least, scale = offset[0, 0], 1 / gain[0, 0]
-    largest: Any = 0
-    for i in range(top, bottom + 1):
-        k = (i - row + half) * stride - column + half
-        for j in range(left, right + 1):
-            adu: Any = np.int64(image[i, j])
-            largest = adu if adu > largest else largest
-            data[k + j] = (adu - least) * scale
-            valid[k + j] = 1.0
-        if maps:
-            for j in range(left, right + 1):
-                o = offset[i, j] if offset.size > 1 else least
-                g = gain[i, j] if gain.size > 1 else gain[0, 0]
-                data[k + j] = (image[i, j] - o) / g
-                read[k + j] = read_variance[i, j] if read_variance.size > 1 else read_variance[0, 0]
-    cut = max(max(half - column, half - row), max(column + half - width + 1, row + half - height + 1))
-    return max(cut, 0), largest
-
-
-@njit(fastmath=_FAST, **_OPTIONS)
-def _soften(x: float, y: float, window: int, stride: int, valid: Array) -> None:
-    """Cut ``valid`` to the square of side ``window - 1`` about (x, y), edge pixels by the part inside.
-
-    A window of whole pixels jumps by one as a particle moves; what its edge cuts from the tails of a
-    defocused image then shifts the fit by half a standard deviation and more.
-    """
-    half = window // 2
-    inside = np.empty(stride)
-    for j in range(stride):
-        inside[j] = min(max(half + 0.5 - abs(j - half - x), 0.0), 1.0)
-    for i in range(window):
-        part = min(max(half + 0.5 - abs(i - half - y), 0.0), 1.0)
-        for k in range(stride):
-            valid[i * stride + k] *= part * inside[k]
-
-
-@njit(fastmath=_FAST_FINITE, **_OPTIONS)
-def _start(data: Array, valid: Array, u: Array, v: Array, window: int, stride: int, theta: Array) -> bool:
-    """First parameters from the window alone: border, peak, and moments above 30 % of it.
-
-    A Gaussian cut at the fraction f of its height and lowered by it has 0.358 of its variance
-    (f = 0.3): [1 - f (1 + L) - f L^2 / 2] / [1 - f - f L], L = -ln f. False without contrast.
-    """
-    half = window // 2
-    background, count = 0.0, 0.0
-    last = (window - 1) * stride
-    for j in range(window):
-        for k in (j, last + j, j * stride, j * stride + window - 1):
-            background += valid[k] * data[k]
-            count += valid[k]
-    if count == 0:
-        return False
-    background /= count
-    # The peak lies in the inner half: a mean of three pixels, against noise.
-    peak = background
-    for i in range(half // 2, window - half // 2):
-        for k in range(i * stride + half // 2, i * stride + window - half // 2):
-            peak = max(peak, (data[k - 1] + data[k] + data[k + 1]) / 3)
-    level = background + 0.3 * (peak - background)
-    m = mx = my = mxx = mxy = myy = 0.0
-    for k in range(data.size):
-        f = valid[k] * max(data[k] - level, 0.0)
-        fu, fv = f * u[k], f * v[k]
-        m += f
-        mx += fu
-        my += fv
-        mxx += fu * u[k]
-        mxy += fu * v[k]
-        myy += fv * v[k]
-    if not (peak > background and m > 0):
-        return False
-    x, y = mx / m, my / m
-    vx = max((mxx / m - x * x) / 0.358, 1.0)
-    vy = max((myy / m - y * y) / 0.358, 1.0)
-    rho = (mxy / m - x * y) / 0.358 / math.sqrt(vx * vy)
-    theta[0], theta[1], theta[2] = x, y, peak - background
-    theta[3], theta[4] = 0.5 * math.log(vx), 0.5 * math.log(vy)
-    theta[5] = math.atanh(min(max(rho, -0.7), 0.7))
-    theta[6] = background
-    return True
-
-
 @njit(**_OPTIONS)
 def _bounded_step(theta: Array, step: Array, window: int, trial: Array) -> bool:
     """``trial = theta + step``, the step shortened where a width or a position would leap."""
@@ -443,36 +526,34 @@ def _inside(theta: Array, window: int) -> bool:
     )
 
 
+# The fit ---------------------------------------------------------------------------------------------
+
+
 @njit(**_OPTIONS)
 def _minimise(
+    kind: int,
     theta: Array,
-    data: Array,
-    noise: Array,
-    valid: Array,
-    u: Array,
-    v: Array,
-    window: int,
-    stride: int,
-    weighting: int,
+    pixels: float,
     most: int,
     tolerance: float,
-    work: Array,
+    side: int,
+    field: Array,
+    columns: Array,
+    algebra: Array,
 ) -> int:
     """Levenberg-Marquardt from ``theta`` in place. Returns the iterations; negative: no convergence."""
-    shape, weights, pulls = work[0], work[1], work[2]
-    moments, t, normal, factor = np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7))
-    raw, gradient, step, trial = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
-    pixels = max(valid.sum(), 8.0)
+    t, normal, factor, moments, spare = algebra[0], algebra[1], algebra[2], algebra[3], algebra[4]
+    raw, gradient, step, trial = algebra[5, 0], algebra[5, 1], algebra[5, 2], algebra[5, 3]
+    pixels = max(pixels, 8.0)
     damping = 0.0
-    _shape(theta, window, stride, shape)
-    objective = _weigh(theta, data, noise, valid, shape, weighting, weights, pulls)
+    objective = _evaluate(kind, theta, side, field, columns)
     renew = True
     for iteration in range(1, most + 1):
         if renew:
-            _moments(shape, u, v, weights, moments)
-            _gradient(shape, u, v, pulls, raw)
+            _moments(columns, moments)
+            _gradient(columns, raw)
             _transformation(theta, t)
-            _normal(t, moments, normal)
+            _normal(t, moments, spare, normal)
             for i in range(7):
                 s = 0.0
                 for m in range(7):
@@ -486,12 +567,11 @@ def _minimise(
         expected = 0.0
         for i in range(7):
             expected += gradient[i] * step[i]
-        whole = _bounded_step(theta, step, window, trial)
+        whole = _bounded_step(theta, step, side, trial)
         if whole and damping < 1e-2 and expected <= tolerance * objective / pixels:
             theta[:] = trial
             return iteration
-        _shape(trial, window, stride, shape)
-        found = _weigh(trial, data, noise, valid, shape, weighting, weights, pulls)
+        found = _evaluate(kind, trial, side, field, columns)
         renew = found <= objective
         if renew:
             theta[:] = trial
@@ -505,24 +585,19 @@ def _minimise(
 
 
 @njit(**_OPTIONS)
-def _curvature(
-    theta: Array, shape: Array, u: Array, v: Array, pulls: Array, spare: Array, curvature: Array
-) -> None:
-    """``curvature[i, j] = sum pulls d2G/(dtheta_i dtheta_j)``: what residuals add to the normal matrix.
+def _curvature(theta: Array, t: Array, moments: Array, raw: Array, spare: Array, curvature: Array) -> None:
+    """``curvature[i, j] = sum p d2G/(dtheta_i dtheta_j)``: what residuals add to the normal matrix.
 
     G_i = E T_i.m with the polynomials m and the columns T_i of the transformation; hence, since
     dE/dtheta_j = E T_j.m / A where j is not A or B,  G_ij = E (dT_i/dtheta_j).m + E (T_i.m)(T_j.m) / A.
+    ``t``: T; ``moments``: with p / E for the weights; ``raw``: the gradient before T.
     """
-    for k in range(shape.size):
-        spare[k] = pulls[k] / max(shape[k], 1e-150)  # times E^2 in _moments
-    moments, raw = np.empty((7, 7)), np.empty(7)
-    _moments(shape, u, v, spare, moments)
     moments[6], moments[:, 6] = 0.0, 0.0
-    _gradient(shape, u, v, pulls, raw)
-    t, after, before, moved = np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7)), np.empty(7)
-    _transformation(theta, t)
-    _normal(t, moments, curvature)
-    curvature /= theta[2]
+    _normal(t, moments, spare, curvature)
+    after, before, moved = np.empty((7, 7)), np.empty((7, 7)), np.empty(7)
+    for i in range(7):
+        for j in range(7):
+            curvature[i, j] /= theta[2]
     for j in range(6):
         step = 1e-4 * (theta[2] if j == 2 else 1.0)
         moved[:] = theta
@@ -543,16 +618,11 @@ def _curvature(
 @njit(**_OPTIONS)
 def _uncertainty(
     theta: Array,
-    data: Array,
-    read: Array,
-    noise: Array,
-    valid: Array,
-    u: Array,
-    v: Array,
-    window: int,
-    stride: int,
-    weighting: int,
-    work: Array,
+    pixels: float,
+    side: int,
+    field: Array,
+    columns: Array,
+    algebra: Array,
     covariance: Array,
 ) -> float:
     """Covariance of x, y, A, sigma_x, sigma_y, rho, B at the solution; returns reduced chi-square.
@@ -562,43 +632,100 @@ def _uncertainty(
     term of H matters where a Gaussian is only an approximation: without it widths and rho claim 12 %
     too little on physical images. Chi-square is Pearson's, with V: 1 for a matched model.
     """
-    shape, weights, pulls, spare = work[0], work[1], work[2], work[3]
-    _shape(theta, window, stride, shape)
-    chi, pixels = 0.0, 0.0
-    for k in range(data.size):
-        model = theta[2] * shape[k] + theta[6]
-        variance = max(model + read[k], VARIANCE_FLOOR)
-        r = data[k] - model
-        chi += valid[k] * r * r / variance
-        pixels += valid[k]
-        weights[k] = noise[k] if weighting in (UNIFORM, RELATIVE) else valid[k] / variance
-        pulls[k] = weights[k] * r
-    moments, t = np.empty((7, 7)), np.empty((7, 7))
-    normal, middle, curvature, factor = np.empty((7, 7)), np.empty((7, 7)), np.empty((7, 7)), np.zeros((7, 7))
+    t, normal, factor, moments, spare = algebra[0], algebra[1], algebra[2], algebra[3], algebra[4]
+    raw, unit, curvature = algebra[5, 0], algebra[5, 1], algebra[6]
     _transformation(theta, t)
-    _moments(shape, u, v, weights, moments)
-    _normal(t, moments, normal)
-    _curvature(theta, shape, u, v, pulls, spare, curvature)
-    if not _factorise(normal - curvature, 0.0, factor) and not _factorise(normal, 0.0, factor):
+    chi = _evaluate(INFORMATION, theta, side, field, columns)
+    _moments(columns, moments)
+    _gradient(columns, raw)
+    _normal(t, moments, spare, normal)
+    _evaluate(BENT, theta, side, field, columns)
+    _moments(columns, moments)
+    _curvature(theta, t, moments, raw, spare, curvature)
+    for i in range(7):
+        for j in range(7):
+            curvature[i, j] = normal[i, j] - curvature[i, j]
+    if not _factorise(curvature, 0.0, factor) and not _factorise(normal, 0.0, factor):
         return np.nan
-    for k in range(data.size):
-        variance = max(theta[2] * shape[k] + theta[6] + read[k], VARIANCE_FLOOR)
-        weights[k] *= weights[k] * variance
-    _moments(shape, u, v, weights, moments)
-    _normal(t, moments, middle)
-    inverse, unit, column = np.empty((7, 7)), np.zeros(7), np.empty(7)
+    _evaluate(SCATTER, theta, side, field, columns)
+    _moments(columns, moments)
+    _normal(t, moments, spare, normal)
+    inverse = curvature
     for i in range(7):
         unit[:] = 0.0
         unit[i] = 1.0
-        _solve(factor, unit, column)
-        inverse[i] = column
-    _normal(inverse, middle, covariance)
+        _solve(factor, unit, inverse[i])
+    _normal(inverse, normal, spare, covariance)
     rho = math.tanh(theta[5])
     scale = (1.0, 1.0, 1.0, math.exp(theta[3]), math.exp(theta[4]), 1 - rho * rho, 1.0)
     for i in range(7):
         for j in range(7):
             covariance[i, j] *= scale[i] * scale[j]
     return chi / max(pixels - 7, 1.0)
+
+
+@njit(**_OPTIONS)
+def _fit(
+    image: Image,
+    column: int,
+    row: int,
+    offset: Array,
+    gain: Array,
+    read_variance: Array,
+    weighting: int,
+    kappa: float,
+    known: bool,
+    theta: Array,
+    side: int,
+    field: Array,
+    columns: Array,
+    algebra: Array,
+    quality: Array,
+) -> tuple[int, int, float]:
+    """Fit the particle near a pixel. ``theta``: start where ``known``; the solution, relative to the pixel
+    that is returned; with the number of pixels that count, negative where the fit fails."""
+    height, width = image.shape
+    cut, largest = _read_window(image, column, row, offset, gain, read_variance, side, field, columns)
+    count = _cover(side, field, columns)
+    if not known and not _start(side, columns.shape[1], field, theta):
+        return column, row, -1.0
+    # First a rough uniform fit: a robust start for every weighting, the place of the window, and the
+    # light that scales the relative weights. Then the fit itself.
+    rough, done = True, 0
+    kind = FIXED if weighting in (UNIFORM, RELATIVE) else weighting
+    for _ in range(MOST_WINDOWS):
+        move_x, move_y = round(theta[0]), round(theta[1])
+        if move_x != 0 or move_y != 0:
+            column, row = column + move_x, row + move_y
+            if not (0 <= column < width and 0 <= row < height):
+                return column, row, -1.0
+            theta[0] -= move_x
+            theta[1] -= move_y
+        if move_x != 0 or move_y != 0 or done > 0:
+            cut, largest = _read_window(image, column, row, offset, gain, read_variance, side, field, columns)
+        if rough:
+            rough = False
+            count = _cover(side, field, columns)
+            field[WEIGHTS] = field[VALID]
+            done = _minimise(FIXED, theta, count, ROUGH_ITERATIONS, ROUGH, side, field, columns, algebra)
+            quality[1] += abs(done)
+            done = 0
+            continue
+        x, y = theta[0], theta[1]
+        _soften(x, y, side, columns)
+        count = _cover(side, field, columns)
+        if weighting == RELATIVE:
+            _fix_weights(True, kappa, theta, side, field, columns)
+        elif weighting == UNIFORM:
+            field[WEIGHTS] = field[VALID]
+        done = _minimise(kind, theta, count, MOST_ITERATIONS, TOLERANCE, side, field, columns, algebra)
+        quality[1] += abs(done)
+        if done < 0 or max(abs(theta[0] - x), abs(theta[1] - y)) <= MOST_OFF_CENTRE:
+            break
+    if kind != FIXED:
+        _fix_weights(False, 0.0, theta, side, field, columns)
+    quality[2], quality[3] = cut, largest
+    return column, row, count if done > 0 and _inside(theta, side) else -1.0
 
 
 @njit(**_OPTIONS)
@@ -619,90 +746,56 @@ def fit_windows(
     """Fit one Gaussian to the window about each start; NaN parameters where a fit fails.
 
     The window follows the particle, to a fraction of a pixel: neither where the detection put it nor
-    where the particle lies between pixels moves the result.
+    where the particle lies between pixels moves the result, nor does a start with a shape; where it leads
+    nowhere, the fit begins again without.
     """
     height, width = image.shape
-    half = window // 2
     stride = (window + LANES - 1) // LANES * LANES
-    size = window * stride
-    data, read, noise, valid = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
-    work, shape, theta = np.empty((4, size)), np.empty(size), np.empty(7)
-    u, v = np.empty(size), np.empty(size)
-    for k in range(size):
-        u[k] = k % stride - half
-        v[k] = k // stride - half
+    field, columns = np.zeros((_FIELDS, window * stride)), np.zeros((_COLUMNS, stride))
+    field[READ] = read_variance[0, 0]
+    for power in range(5):
+        for j in range(stride):
+            columns[POWERS + power, j] = float(j - window // 2) ** power
+    algebra, theta = np.zeros((7, 7, 7)), np.empty(7)
     for n in range(len(starts)):
         parameters[n] = np.nan
         covariance[n] = np.nan
         quality[n] = (np.nan, 0.0, 0.0, 0.0)
-        if not (-0.5 <= starts[n, 0] < width - 0.5 and -0.5 <= starts[n, 1] < height - 0.5):
+        start = starts[n]
+        if not (-0.5 <= start[0] < width - 0.5 and -0.5 <= start[1] < height - 0.5):
             continue
-        column, row = round(starts[n, 0]), round(starts[n, 1])
-        cut, largest = _read_window(
-            image, column, row, offset, gain, read_variance, window, stride, data, read, valid
-        )
-        if not _start(data, valid, u, v, window, stride, theta):
-            continue
-        # First a rough uniform fit: a robust start for every weighting, the place of the window, and the
-        # light that scales the relative weights. Then the fit itself.
-        rough, iterations, done = True, 0, -1
-        for _ in range(MOST_WINDOWS):
-            move_x, move_y = round(theta[0]), round(theta[1])
-            if move_x != 0 or move_y != 0:
-                column, row = column + move_x, row + move_y
-                if not (0 <= column < width and 0 <= row < height):
-                    done = -1
-                    break
-                theta[0] -= move_x
-                theta[1] -= move_y
-            if move_x != 0 or move_y != 0 or done > 0:
-                cut, largest = _read_window(
-                    image, column, row, offset, gain, read_variance, window, stride, data, read, valid
-                )
-            if rough:
-                rough = False
-                iterations += abs(
-                    _minimise(
-                        theta,
-                        data,
-                        valid,
-                        valid,
-                        u,
-                        v,
-                        window,
-                        stride,
-                        UNIFORM,
-                        ROUGH_ITERATIONS,
-                        ROUGH,
-                        work,
-                    )
-                )
-                continue
-            x, y = theta[0], theta[1]
-            _soften(x, y, window, stride, valid)
-            _shape(theta, window, stride, shape)
-            for k in range(size):
-                if weighting == UNIFORM:
-                    noise[k] = valid[k]
-                elif weighting == RELATIVE:
-                    noise[k] = valid[k] / (shape[k] + kappa)
-                else:
-                    noise[k] = read[k]
-            done = _minimise(
-                theta, data, noise, valid, u, v, window, stride, weighting, MOST_ITERATIONS, TOLERANCE, work
+        known = not math.isnan(start[2])
+        pixels = -1.0
+        while True:
+            column, row = round(start[0]), round(start[1])
+            if known:
+                theta[0], theta[1], theta[2], theta[6] = start[0] - column, start[1] - row, start[2], start[6]
+                theta[3], theta[4], theta[5] = math.log(start[3]), math.log(start[4]), math.atanh(start[5])
+            column, row, pixels = _fit(
+                image,
+                column,
+                row,
+                offset,
+                gain,
+                read_variance,
+                weighting,
+                kappa,
+                known,
+                theta,
+                window,
+                field,
+                columns,
+                algebra,
+                quality[n],
             )
-            iterations += abs(done)
-            if done < 0 or max(abs(theta[0] - x), abs(theta[1] - y)) <= MOST_OFF_CENTRE:
+            if pixels >= 0 or not known:
                 break
-        quality[n, 1] = iterations
-        if done < 0 or not _inside(theta, window):
+            known = False
+        if pixels < 0:
             continue
-        chi_square = _uncertainty(
-            theta, data, read, noise, valid, u, v, window, stride, weighting, work, covariance[n]
-        )
+        chi_square = _uncertainty(theta, pixels, window, field, columns, algebra, covariance[n])
         quality[n, 0] = chi_square
-        quality[n, 2] = cut
-        quality[n, 3] = 1.0 if largest >= saturation else 0.0
+        quality[n, 3] = 1.0 if quality[n, 3] >= saturation else 0.0
         if math.isnan(chi_square):
             continue
         parameters[n, 0], parameters[n, 1] = column + theta[0], row + theta[1]

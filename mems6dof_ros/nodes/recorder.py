@@ -1,7 +1,8 @@
 """``recorder``: topics to a bag (rosbag2, MCAP) as they come over the wire, without decoding them.
 
 Services (std_srvs/Trigger): ``~/start`` begins a new bag, and brings the node up if need be, ``~/stop``
-completes it, as deactivation does. What a publisher had sent before the node was told to end is still written.
+completes it, as deactivation does. What a publisher had sent before the node was told to end is still
+written.
 """
 
 from __future__ import annotations

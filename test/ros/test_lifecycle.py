@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -112,7 +113,7 @@ def test_an_inactive_source_publishes_nothing_and_goes_on_where_it_was(start: St
     assert state(peer, "frame_source") == "active"
     peer.wait(lambda: len(stamps) >= before + 5)
     ns = [image.header.stamp.sec * 10**9 + image.header.stamp.nanosec for image in stamps]
-    periods = {round((b - a) / (1e9 / 90), 3) for a, b in zip(ns, ns[1:], strict=False)}
+    periods = {round((b - a) / (1e9 / 90), 3) for a, b in itertools.pairwise(ns)}
     assert periods == {1.0}  # none lost, none twice
 
 

@@ -16,6 +16,8 @@ from mems6dof_ros.errors import Mems6dofError
 COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "simulate": "mems6dof_ros.cli.simulate",
     "calibrate": "mems6dof_ros.cli.calibrate",
+    "calibrate-field": "mems6dof_ros.cli.calibrate_field",
+    "scan": "mems6dof_ros.cli.scan",
     "analyze": "mems6dof_ros.cli.analyze",
     "report": "mems6dof_ros.cli.report",
     "check": "mems6dof_ros.cli.check",

@@ -11,7 +11,8 @@ while the node is active, and nothing is published while it is not; ``~/start`` 
 Deactivated it keeps its place among the frames, cleaned up it closes the source.
 
 Topics (relative): ``frame_info``, ``truth`` where the source knows it, ``camera_info``, and then
-``image_raw``, all with one header. With ``simulator.commanded`` also those of ``nodes.actuation``.
+``image_raw``, all with one header. With ``simulator.commanded`` also those of ``nodes.actuation``;
+a source that is a Stage (``simulator.substrate``) adds the service of ``nodes.stage``.
 """
 
 from __future__ import annotations
@@ -35,11 +36,13 @@ from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.actuation import serve_commanded_simulator
 from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter, of_settings
+from mems6dof_ros.nodes.stage import serve_stage
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import CommandedSimulator
 from mems6dof_ros.sources.source import SOURCES, open_source
+from mems6dof_ros.sources.stage import Stage
 
 #: What tells that a frame has been dealt with, and its type.
 ACKNOWLEDGING = {topics.LOCALIZATIONS: Localizations, topics.POSE_6DOF: Pose6DOF}
@@ -91,6 +94,19 @@ PARAMETERS = (
         "simulator.commanded",
         False,
         "The gear turns only as actuation_command asks, a frame for each motion cycle; use with rate 0.0.",
+    ),
+    Parameter(
+        "simulator.substrate",
+        False,
+        "Beads on a plane substrate in place of the gear, and the stage that the calibrator moves.",
+    ),
+    Parameter("simulator.substrate_beads", 200, "Beads in the disc about the image.", "1", (1, 10_000)),
+    Parameter(
+        "simulator.substrate_rotation",
+        0.0,
+        "Orientation of the substrate about the optical axis.",
+        "rad",
+        (-7.0, 7.0),
     ),
     Parameter("simulator.cycles", 0, "Motion cycles to simulate; 0: no end.", "cycles", (0, 2**31 - 1)),
     Parameter(
@@ -173,6 +189,8 @@ class FrameSourceNode(InstrumentNode):
             self.create_subscription(kind, topic, self._on_acknowledged, transport.MESSAGES, raw=True)
         if isinstance(self._source, CommandedSimulator):
             serve_commanded_simulator(self, self._source)
+        if isinstance(self._source, Stage):
+            serve_stage(self, self._source)
         self._abandon = False
         self._in_flight.clear()
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)

@@ -41,6 +41,7 @@ NODES = (
     "pose_estimator",
     "pipeline",
     "recorder",
+    "calibrator",
     "controller",
     "monitor",
     "foxglove_bridge",

@@ -10,6 +10,7 @@ files in ``launch_scripts/`` hand the same tables to `launch`. From a shell, wit
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -27,6 +28,9 @@ from mems6dof_ros.nodes.common import PARENT_VARIABLE, WAIT_PARAMETER
 from mems6dof_ros.nodes.parameters import to_yaml
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
 from mems6dof_ros.recording import topics
+from mems6dof_ros.recording.frames import camera_to_json
+from mems6dof_ros.simulation.settings import SimulationSettings
+from mems6dof_ros.sources.simulator import camera_noise
 
 #: What each node publishes and can be told to hold back until somebody listens.
 _PUBLISHED = {
@@ -208,6 +212,29 @@ def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
     return chain(source, controller=controller, **_common(values))
 
 
+def _calibrate(values: Mapping[str, str]) -> list[NodeSpec]:
+    """A camera, the stage of it where it is simulated, and the calibrator; all else waits for a goal."""
+    remap = {topics.IMAGE: values["image_topic"]} if values["image_topic"] != topics.IMAGE else {}
+    calibrator = NodeSpec("calibrator", remappings=remap)
+    if values["source"] == "none":
+        return [calibrator]
+    camera = {"source": values["source"], "pacing": "rate", "rate": float(values["rate"])}
+    if values["source"] != "simulator":
+        return [NodeSpec("frame_source", camera), calibrator]
+    size = int(values["size"])
+    simulated_substrate = {
+        "simulator.substrate": True,
+        "simulator.substrate_beads": max(200 * size**2 // 2048**2, 12),
+        "simulator.width_px": size,
+        "simulator.height_px": size,
+        "simulator.seed": int(values["seed"]),
+        "simulator.optics_seed": int(values["optics_seed"]),
+    }
+    noise = json.loads(camera_to_json(camera_noise(SimulationSettings())))
+    known = {f"camera.{name}": float(value) for name, value in noise.items()}
+    return [NodeSpec("frame_source", camera | simulated_substrate), replace(calibrator, parameters=known)]
+
+
 def _common(values: Mapping[str, str]) -> dict[str, Any]:
     """What ``chain`` is told by the arguments that every system has."""
     return {
@@ -298,6 +325,18 @@ SYSTEMS = {
             **_NAMESPACE,
         },
         _closed_loop,
+    ),
+    "calibrate": System(
+        "A camera over a substrate of beads, a stage, and the calibrator, which waits for 'mems6dof scan'.",
+        {
+            "source": ("simulator", "Source of the frames; none: a camera driver publishes image_topic"),
+            "rate": ("5.0", "Frames per second; 0.0: as the source delivers them"),
+            "image_topic": (topics.IMAGE, "Topic of the images"),
+            **_SIMULATION,
+            **_CONFIG,
+            **_NAMESPACE,
+        },
+        _calibrate,
     ),
 }
 

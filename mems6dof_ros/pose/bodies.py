@@ -53,6 +53,15 @@ class Bodies:
             poses.append(pose)
         return poses
 
+    def measured_field(self) -> FieldError:
+        """The field error by all cycles so far. Raises InputError before the first."""
+        constellations = [estimator.constellation for estimator in self.estimators if estimator.constellation]
+        if not constellations:
+            raise InputError("field error", "no cycle yet", "cycles of a body that turns")
+        for constellation in constellations:
+            constellation.refine()
+        return constellations[0].field
+
     def reset(self) -> None:
         """Forget everything measured of all bodies."""
         for estimator in self.estimators:

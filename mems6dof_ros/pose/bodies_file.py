@@ -27,13 +27,15 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.pose.bodies import COMMON_SETTINGS, Bodies
 from mems6dof_ros.pose.constellation_file import ReferenceConstellation
 from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.pose.field import FieldError
 from mems6dof_ros.pose.settings import PoseSettings, Region
 
 _OF_A_BODY = ("region", "constellation", "settings")
 
 
-def load_bodies(path: Path, settings: PoseSettings | None = None) -> Bodies:
-    """The estimators that ``path`` describes, in its order; ``settings`` where it sets nothing of its own.
+def load_bodies(path: Path, settings: PoseSettings | None = None, field: FieldError | None = None) -> Bodies:
+    """The estimators that ``path`` describes, in its order; ``settings`` where it sets nothing of its own;
+    ``field``: what is known of the field error.
 
     Raises InputError for anything but the form above, and for bodies that cannot be told apart.
     """
@@ -49,10 +51,12 @@ def load_bodies(path: Path, settings: PoseSettings | None = None) -> Bodies:
     settings, bodies = replace(settings or PoseSettings(), **common), content.get("bodies")
     if not isinstance(bodies, dict) or not bodies:
         raise InputError(str(path), "no bodies", "'bodies:' with one entry for each")
-    return Bodies([_estimator(str(name), entry, path, settings) for name, entry in bodies.items()])
+    return Bodies([_estimator(str(name), entry, path, settings, field) for name, entry in bodies.items()])
 
 
-def _estimator(name: str, entry: Any, path: Path, settings: PoseSettings) -> PoseEstimator:
+def _estimator(
+    name: str, entry: Any, path: Path, settings: PoseSettings, field: FieldError | None
+) -> PoseEstimator:
     where = f"{path}: body {name}"
     entry = _mapping(entry, where, _OF_A_BODY)
     names = [item.name for item in fields(PoseSettings) if item.name not in COMMON_SETTINGS]
@@ -62,7 +66,7 @@ def _estimator(name: str, entry: Any, path: Path, settings: PoseSettings) -> Pos
         region = _region(entry["region"], f"{where}: region")
     if "constellation" in entry:
         reference = ReferenceConstellation.load(path.parent / str(entry["constellation"]))
-    return PoseEstimator(replace(settings, **own), name, region, reference)
+    return PoseEstimator(replace(settings, **own), name, region, reference, field)
 
 
 def _region(entry: Any, where: str) -> Region:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mems6dof_ros.calibration.field_correction import FieldCorrection
 from mems6dof_ros.calibration.field_modes import FieldModes
 from mems6dof_ros.pose.settings import PoseSettings
 
@@ -28,12 +29,20 @@ class FieldError:
 
     @classmethod
     def assumed(cls, settings: PoseSettings, half_size: Array) -> FieldError:
-        """What ``settings`` assume of the field they state, else of one of half-widths ``half_size`` (2,) m."""
+        """What ``settings`` assume, of the field that they state or of half-widths ``half_size`` (2,) m."""
         width, height = settings.field_size or 2 * half_size
         # A chain of micrographs has no map from which the field error could be told.
         degree = settings.field_degree if settings.reference == "map" else 0
         modes = FieldModes((float(width) / 2, float(height) / 2), degree)
         return cls(modes, np.diag(modes.prior_variance(settings.field_sd_xy, settings.field_sd_z)))
+
+    @classmethod
+    def remaining(cls, correction: FieldCorrection | None, settings: PoseSettings) -> FieldError | None:
+        """What is left of it where a calibration has a ``correction``, which positions have had; None without
+        one, or where ``settings`` do not estimate a field error."""
+        if correction is None or settings.reference != "map" or settings.field_degree == 0:
+            return None
+        return cls(correction.modes, correction.covariance)
 
     def tell(self, body: str, information: Array, vector: Array) -> None:
         """The evidence of ``body`` so far, its particles and poses eliminated: ``information`` (k, k) m^-2,

@@ -33,6 +33,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
         "pose": "mems6dof_ros.cli.validate_pose",
         "cameras": "mems6dof_ros.cli.validate_cameras",
         "control": "mems6dof_ros.cli.validate_control",
+        "monitor": "mems6dof_ros.cli.validate_monitor",
         "lab": "mems6dof_ros.cli.validate_lab",
     },
 }

@@ -37,16 +37,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the tables; 1 where a figure misses its requirement."""
     from mems6dof_ros.errors import InputError
-    from mems6dof_ros.simulation.settings import SimulationSettings
 
     for name in ("drives", "targets"):
         if getattr(args, name) < 1:
             raise InputError(f"--{name}", str(getattr(args, name)), "1 or more")
-    rows = [*_synthetic(args.drives, args.targets), *_faults()]
-    if not args.no_ros:
-        settings = SimulationSettings(width_px=args.size, height_px=args.size, seed=args.seed)
-        with tempfile.TemporaryDirectory() as folder:
-            rows += _real(settings, args.targets, args.calibration, Path(folder))
+    rows = measure(args.drives, args.targets, args.size, args.seed, args.calibration, ros=not args.no_ros)
     print()
     parameters = {
         "drives": args.drives,
@@ -56,6 +51,25 @@ def run(args: argparse.Namespace) -> int:
         "no_ros": args.no_ros,
     }
     return conclude(rows, parameters, args.json)
+
+
+def measure(
+    drives: int,
+    targets: int,
+    size: int = 1024,
+    seed: int = 1,
+    calibration: Path | None = None,
+    ros: bool = True,
+) -> list[dict[str, Any]]:
+    """Print the tables and return the rows that have a requirement, and those of the reaction."""
+    from mems6dof_ros.simulation.settings import SimulationSettings
+
+    rows = [*_synthetic(drives, targets), *_faults()]
+    if ros:
+        settings = SimulationSettings(width_px=size, height_px=size, seed=seed)
+        with tempfile.TemporaryDirectory() as folder:
+            rows += _real(settings, targets, calibration, Path(folder))
+    return rows
 
 
 def _row(quantity: str, measured: float, limit: float) -> dict[str, Any]:
@@ -127,6 +141,7 @@ def _real(
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.control.validation import open_loop, random_targets
     from mems6dof_ros.nodes.closed_loop import approach, closed_loop, data_sheet, safe_stops
+    from mems6dof_ros.nodes.loop_client import stages
 
     if calibration is None:
         calibration = folder / "optics.yaml"
@@ -138,7 +153,7 @@ def _real(
         Progress("validate control: targets") as progress,
     ):
         closed = approach(client, settings, angles, progress)
-        table = stage_table(client)
+        table, times = stage_table(client), stages(client)
     size = f"{settings.width_px} x {settings.height_px} px"
     print(f"\nangle error, mrad; {targets} random targets through ROS 2, frames of {size}")
     print(f"{'':34}{'rms':>10}{'largest':>10}{'cycles':>10}")
@@ -150,6 +165,12 @@ def _real(
     largest = np.inf if any(move.reason for move in closed) else max(abs(move.error) for move in closed) * 1e3
     rows = [_row("largest error, mrad: ROS 2", float(largest), max(drive.resolution, 1e-3) * 1e3)]
     print(f"\n{table}")
+    for name, what in (("reaction", "frame to next command"), ("bare transport", "its bare transport")):
+        for label, percent in (("median", 50), ("99 %", 99)):
+            measured = float(np.percentile(times[name], percent)) * 1e3
+            rows.append(
+                {"quantity": f"{what}, ms, {label}", "measured": measured, "required": "", "passed": None}
+            )
     print("\nmotion cycles exposed after a loss; ROS 2")
     for name, cycles, reason in safe_stops(settings, calibration, folder / "nodes.log"):
         rows.append(_row(f"cycles after: {name}", cycles, 1))

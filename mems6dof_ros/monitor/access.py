@@ -12,6 +12,7 @@ import hmac
 import ipaddress
 import secrets
 import socket
+import ssl
 from functools import cache
 from urllib.parse import quote, urlsplit
 
@@ -53,11 +54,34 @@ def choose_token(address: str, token: str) -> str:
     return token if token or is_loopback(address) else secrets.token_urlsafe(24)
 
 
-def page_url(address: str, port: int, token: str) -> str:
+def encryption(certificate: str, key: str) -> ssl.SSLContext | None:
+    """What to encrypt with: ``certificate`` (with its chain) and ``key`` are PEM files; None: neither given.
+
+    Raises InputError where only one is given, or they cannot be used.
+    """
+    if not certificate and not key:
+        return None
+    if not certificate or not key:
+        raise InputError("encryption", "one of certificate and key", "both, or neither")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        # A password would be asked for on a terminal that a node may not have.
+        context.load_cert_chain(certificate, key, password=lambda: "")
+    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"certificate {certificate}, key {key}",
+            reason,
+            "PEM files that belong together, key not encrypted",
+        ) from error
+    return context
+
+
+def page_url(scheme: str, address: str, port: int, token: str) -> str:
     """What to open in a browser to see the page that is served on ``address``."""
     ip = ipaddress.ip_address(address)
     host = socket.gethostname() if ip.is_unspecified else f"[{ip}]" if ip.version == 6 else str(ip)
-    return f"http://{host}:{port}/" + (f"?token={quote(token)}" if token else "")
+    return f"{scheme}://{host}:{port}/" + (f"?token={quote(token)}" if token else "")
 
 
 def token_matches(given: str, token: str) -> bool:

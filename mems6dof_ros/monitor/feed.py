@@ -88,9 +88,9 @@ class Feed:
             self._picture = (self._picture[0] + 1, picture)
 
     def set_instrument(self, state: dict[str, Any]) -> None:
-        """Replace what is known of the instrument as a whole (JSON-ready: rates, services, ...)."""
+        """Replace parts of what is known of the instrument as a whole (JSON-ready: rates, services, ...)."""
         with self._lock:
-            self._instrument = state
+            self._instrument |= state
 
     def tell(self, level: str, text: str) -> None:
         """Add a line to the log of the page; what would flood it is only counted."""

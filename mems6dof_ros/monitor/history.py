@@ -90,7 +90,8 @@ class History:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.epoch = 0
-        self._rows = np.empty((capacity, len(COLUMNS)))
+        # Filled, so that all memory it will ever take is taken now.
+        self._rows = np.full((capacity, len(COLUMNS)), math.nan)
         self._first = 0
         self._end = 0
         self._lock = threading.Lock()

@@ -6,8 +6,11 @@ Protocol of the WebSocket. Numbers are SI. To the page, text is JSON with a ``ty
     1, epoch, rows n, columns m, then n x m float64: rows of the history, every one of them
     2, bytes of JSON j, bytes of JPEG, 0, then the JSON padded with blanks to j, then the JPEG
 
-From the page, text only, at most MAX_MESSAGE bytes: ``call`` a service, set a ``limit``, ``remove_limit``,
-``pictures`` wanted or not. Anything else closes the connection.
+From the page, text only, at most MAX_MESSAGE bytes: ``call`` a service (some with a number), set a ``limit``,
+``remove_limit``, ``pictures`` wanted or not. Anything else closes the connection.
+
+What waits for a page is bounded: rows wait in the history that all pages share, of pictures and states only
+the newest is ever sent, and a page that takes nothing for _SEND_TIMEOUT is closed.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import json
 import logging
 import math
 import os
+import socket
 import struct
 import threading
 import time
@@ -32,6 +36,7 @@ from aiohttp import WSMsgType, web
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.monitor import access
 from mems6dof_ros.monitor.alarms import QUANTITIES, Limit
+from mems6dof_ros.monitor.door import Door
 from mems6dof_ros.monitor.feed import Feed
 from mems6dof_ros.monitor.history import COLUMNS
 from mems6dof_ros.monitor.picture import Picture
@@ -43,6 +48,8 @@ MAX_MESSAGES_PER_SECOND = 50
 _TICK = 0.04
 _ROWS_PER_BATCH = 2000
 _SEND_TIMEOUT = 10.0
+#: Bytes that the kernel may hold for a page: on a slow line, more of them would be seconds of the past.
+_SEND_BUFFER = 2**18
 _CALL_TIMEOUT = 5.0
 _REFUSALS_LOGGED = 20
 _REFUSALS_PERIOD = 10.0
@@ -55,8 +62,8 @@ _TYPES = {
     ".LICENSE": "text/plain; charset=utf-8",
 }
 
-#: Calls a service by its name; the result is (success, message).
-Caller = Callable[[str], "Future[tuple[bool, str]]"]
+#: Calls a service by its name, with a number or None; the result is (success, message).
+Caller = Callable[[str, "float | None"], "Future[tuple[bool, str]]"]
 
 
 class _Refused(Exception):
@@ -67,7 +74,8 @@ class MonitorServer:
     """Serves the page from a thread of its own.
 
     ``call`` is asked to call one of the services that the feed's state lists. Without a token, only
-    loopback addresses are served; for others one is made. ``log`` hears of every refusal.
+    loopback addresses are served; for others one is made. ``certificate`` and its ``key``: PEM files; with
+    them, https is spoken instead of http. ``log`` hears of every refusal.
     """
 
     def __init__(
@@ -78,10 +86,13 @@ class MonitorServer:
         address: str = "127.0.0.1",
         port: int = 0,
         token: str = "",
+        certificate: str = "",
+        key: str = "",
         log: Callable[[str], None] = print,
     ) -> None:
         if not 0 <= port <= 65535:
             raise InputError("port", str(port), "0 (any free one) to 65535")
+        self._encryption = access.encryption(certificate, key)
         self._feed = feed
         self._call = call
         self._address = address
@@ -109,7 +120,7 @@ class MonitorServer:
             self._thread.join(timeout=5)
 
     def _run(self) -> None:
-        with _logged_by(self._log):
+        with _heard(self._note_refusal, self._log):
             asyncio.run(self._serve())
 
     async def _serve(self) -> None:
@@ -119,9 +130,13 @@ class MonitorServer:
         app.on_response_prepare.append(_add_security_headers)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
+        assert runner.server is not None
+        self._door = Door(runner.server, self._note_refusal)
+        self._loop = asyncio.get_running_loop()
         try:
-            site = web.TCPSite(runner, self._address, self._port)
-            await site.start()
+            listening = await self._loop.create_server(
+                self._door.newcomer, self._address, self._port, ssl=self._encryption
+            )
         except OSError as error:
             await runner.cleanup()
             where = f"address {self._address}, port {self._port}"
@@ -130,10 +145,11 @@ class MonitorServer:
             reason = os.strerror(number).lower() if number > 0 else str(error)
             self._url.set_exception(InputError(where, reason, "an address and port free here"))
             return
-        self._loop = asyncio.get_running_loop()
-        host, port, *_ = runner.addresses[0]
-        self._url.set_result(access.page_url(host, port, self._token))
+        host, port, *_ = listening.sockets[0].getsockname()
+        scheme = "https" if self._encryption else "http"
+        self._url.set_result(access.page_url(scheme, host, port, self._token))
         await self._stopping.wait()
+        listening.close()
         for page in list(self._pages):
             await page.close(code=1001, message=b"the monitor stops")
         await runner.cleanup()
@@ -145,6 +161,8 @@ class MonitorServer:
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         """Let in who may talk to the page, see ``access``; say no to everybody else, and log it."""
+        if request.transport is not None:
+            self._door.answered(request.transport)
         try:
             if not access.host_allowed(request.host):
                 raise web.HTTPForbidden(text="This host name is not served.\n")
@@ -168,7 +186,10 @@ class MonitorServer:
     def _admit(self) -> web.Response:
         """Exchange the token in the address, which is seen and kept in histories, for a cookie."""
         response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(access.COOKIE, self._token, httponly=True, samesite="Strict", path="/")
+        secure = self._encryption is not None
+        response.set_cookie(
+            access.COOKIE, self._token, httponly=True, samesite="Strict", path="/", secure=secure
+        )
         return response
 
     async def _file(self, request: web.Request) -> web.Response:
@@ -183,25 +204,34 @@ class MonitorServer:
             raise web.HTTPForbidden(text="Only the page itself may connect.\n")
         if len(self._pages) >= MAX_PAGES:
             raise web.HTTPServiceUnavailable(text=f"{MAX_PAGES} pages are open already.\n")
-        socket = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, compress=False, heartbeat=20.0)
-        await socket.prepare(request)
-        self._pages.add(socket)
-        page = _Page(self._feed, socket, self._call)
+        page_socket = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, compress=False, heartbeat=20.0)
+        await page_socket.prepare(request)
+        assert request.transport is not None
+        self._door.settled(request.transport)
+        request.transport.get_extra_info("socket").setsockopt(
+            socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER
+        )
+        self._pages.add(page_socket)
+        page = _Page(self._feed, page_socket, self._call)
         sender = asyncio.create_task(page.send())
         try:
             await page.receive()
         except _Refused as refusal:
             self._log_refusal(request, str(refusal))
-            await socket.close(code=1008, message=str(refusal).encode()[:120])
+            await page_socket.close(code=1008, message=str(refusal).encode()[:120])
         finally:
-            self._pages.discard(socket)
+            self._pages.discard(page_socket)
             page.leave()
             sender.cancel()
             with suppress(asyncio.CancelledError, ConnectionError, asyncio.TimeoutError):
                 await sender
-        return socket
+        return page_socket
 
     def _log_refusal(self, request: web.Request, reason: str) -> None:
+        # Never the query: it may hold a token.
+        self._note_refusal(f"{request.method} {_shown(request.path)} from {request.remote}: {reason}")
+
+    def _note_refusal(self, what: str) -> None:
         """One line for a refusal; whoever floods the page does not flood the log."""
         now = time.monotonic()
         if len(self._refusals) == _REFUSALS_LOGGED and now - self._refusals[0] < _REFUSALS_PERIOD:
@@ -210,8 +240,7 @@ class MonitorServer:
         hidden, self._refusals_hidden = self._refusals_hidden, 0
         self._refusals.append(now)
         more = f" ({hidden} refusals before it not logged)" if hidden else ""
-        # Never the query: it may hold a token.
-        self._log(f"refused {request.method} {_shown(request.path)} from {request.remote}: {reason}{more}")
+        self._log(f"refused {what}{more}")
 
 
 class _Page:
@@ -292,7 +321,11 @@ class _Page:
     async def _obey(self, request: dict[str, Any]) -> None:
         match request:
             case {"type": "call", "id": int(number), "service": str(service), **rest} if not rest:
-                await self._call_service(number, service)
+                await self._call_service(number, service, None)
+            case {"type": "call", "id": int(number), "service": str(service), "value": value, **rest} if (
+                not rest
+            ):
+                await self._call_service(number, service, _number(value))
             case {"type": "limit", "quantity": str(quantity), "low": low, "high": high, **rest} if not rest:
                 try:
                     self._feed.set_limit(Limit(quantity, _bound(low, -math.inf), _bound(high, math.inf)))
@@ -305,11 +338,13 @@ class _Page:
             case _:
                 raise _Refused(f"not a request: {_shown(json.dumps(request))}")
 
-    async def _call_service(self, number: int, service: str) -> None:
+    async def _call_service(self, number: int, service: str, value: float | None) -> None:
         if service not in self._feed.state().get("services", {}):
             raise _Refused(f"no service {_shown(service)}")
         try:
-            success, text = await asyncio.wait_for(asyncio.wrap_future(self._call(service)), _CALL_TIMEOUT)
+            success, text = await asyncio.wait_for(
+                asyncio.wrap_future(self._call(service, value)), _CALL_TIMEOUT
+            )
         except asyncio.TimeoutError:
             success, text = False, f"no answer within {_CALL_TIMEOUT:.0f} s"
         self._feed.tell(
@@ -333,10 +368,12 @@ def _parse(text: str) -> dict[str, Any]:
 
 
 def _bound(value: object, default: float) -> float:
-    if value is None:
-        return default
+    return default if value is None else _number(value)
+
+
+def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-        raise _Refused(f"a limit of {_shown(str(value))}")
+        raise _Refused(f"a number of {_shown(str(value))}")
     return float(value)
 
 
@@ -367,20 +404,28 @@ async def _add_security_headers(_: web.Request, response: web.StreamResponse) ->
 
 
 @contextmanager
-def _logged_by(log: Callable[[str], None]) -> Iterator[None]:
-    """Route what aiohttp has to say (malformed requests, mostly) through ``log``, one line each."""
+def _heard(refused: Callable[[str], None], log: Callable[[str], None]) -> Iterator[None]:
+    """Hand on what aiohttp has to say: malformed requests to ``refused``, defects to ``log``."""
+    malformed = "Error handling request"
 
     class Handler(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            cause = f": {_shown(str(record.exc_info[1]))}" if record.exc_info and record.exc_info[1] else ""
-            log(record.getMessage() + cause)
+            text = record.getMessage()
+            if record.exc_info and record.exc_info[1]:
+                text += f": {_shown(str(record.exc_info[1]))}"
+            if text.startswith(malformed):
+                refused(f"a request{text.removeprefix(malformed)}")
+            else:
+                log(text)
 
     logger = logging.getLogger("aiohttp.server")
-    handler, propagate = Handler(), logger.propagate
+    before = logger.level, logger.propagate
+    handler = Handler()
     logger.addHandler(handler)
-    logger.propagate = False
+    # Malformed methods are told as details only, the other malformed requests as errors.
+    logger.level, logger.propagate = logging.DEBUG, False
     try:
         yield
     finally:
         logger.removeHandler(handler)
-        logger.propagate = propagate
+        logger.level, logger.propagate = before

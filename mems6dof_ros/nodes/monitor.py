@@ -261,7 +261,7 @@ class MonitorNode(InstrumentNode):
 
     # What the page asks for ---------------------------------------------------------------------
 
-    def _call(self, service: str) -> Future[tuple[bool, str]]:
+    def _call(self, service: str, value: float | None) -> Future[tuple[bool, str]]:
         """Call a service from the server's thread."""
         client = self._triggers[service]
         answer: Future[tuple[bool, str]] = Future()

@@ -12,7 +12,8 @@ import pytest
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "ros")]
 
 from monitor_helpers import Instrument, Served  # noqa: E402
-from synthetic import Machine  # noqa: E402
+
+from mems6dof_ros.monitor.synthetic import Machine  # noqa: E402
 
 
 @pytest.fixture
@@ -31,9 +32,7 @@ def serve() -> Iterator[Callable[..., Served]]:
 
 @pytest.fixture(scope="module")
 def instrument() -> Iterator[Instrument]:
-    running = Instrument(
-        "-p", "port:=0", machine_args=("--rate", "60", "--size", "512", "--image-every", "6")
-    )
+    running = Instrument("-p", "port:=0", machine_args=("rate:=60.0", "size:=512", "image_every:=6"))
     yield running
     running.stop()
 

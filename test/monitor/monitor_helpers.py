@@ -17,8 +17,7 @@ from peers import own_domain
 from mems6dof_ros.monitor.feed import Feed
 from mems6dof_ros.monitor.server import MonitorServer
 
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 class Served:
@@ -32,20 +31,21 @@ class Served:
         self.server = MonitorServer(self.feed, self._call, log=self.log.append, **options)
         self.url = self.server.start()
 
-    def _call(self, service: str) -> Future[tuple[bool, str]]:
-        self.called.append(service)
+    def _call(self, service: str, value: float | None) -> Future[tuple[bool, str]]:
+        self.called.append(service if value is None else f"{service} {value}")
         answer: Future[tuple[bool, str]] = Future()
         answer.set_result((True, "stopped"))
         return answer
 
 
 class Instrument:
-    """A node that watches, by default the monitor, and the synthetic gear; in a ROS domain of their own."""
+    """A node that watches, by default the monitor, and the synthetic gear, with the
+    parameters ``machine_args``, if any; in a ROS domain of their own."""
 
     def __init__(
         self,
         *monitor_args: str,
-        machine_args: tuple[str, ...] = (),
+        machine_args: tuple[str, ...] | None = (),
         module: str = "mems6dof_ros.nodes.monitor",
         says: str = "live page: ",
     ) -> None:
@@ -61,7 +61,10 @@ class Instrument:
         self.lines: list[str] = []
         self._says = says
         self.monitor = self._start("-m", module, "--ros-args", *monitor_args)
-        self.machine = self._start(str(HERE / "synthetic.py"), *machine_args)
+        self.machine: subprocess.Popen[str] | None = None
+        if machine_args is not None:
+            arguments = [word for option in machine_args for word in ("-p", option)]
+            self.machine = self._start("-m", "mems6dof_ros.nodes.synthetic_gear", "--ros-args", *arguments)
         threading.Thread(target=self._read, daemon=True).start()
 
     def _start(self, *arguments: str) -> subprocess.Popen[str]:
@@ -92,9 +95,9 @@ class Instrument:
 
     def stop(self) -> int:
         """End both; returns the exit status of the monitor."""
-        if self.machine.poll() is None:
+        if self.machine:
             self.machine.terminate()
-        self.machine.wait(10)
+            self.machine.wait(10)
         if self.monitor.poll() is None:
             self.monitor.send_signal(signal.SIGINT)
         status = self.monitor.wait(10)

@@ -9,7 +9,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from synthetic import Machine
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame, GroundTruth
@@ -17,6 +16,7 @@ from mems6dof_ros.monitor.alarms import QUANTITIES, Alarms, Limit
 from mems6dof_ros.monitor.feed import MAX_BODIES, Feed
 from mems6dof_ros.monitor.history import COLUMNS, History, pose_row
 from mems6dof_ros.monitor.picture import encode, make_picture
+from mems6dof_ros.monitor.synthetic import Machine
 from mems6dof_ros.monitor.truth import TruthAlignment
 from mems6dof_ros.pose.angles import from_swing_twist, swing_twist
 from mems6dof_ros.pose.cycle_pose import Status

@@ -63,7 +63,7 @@ def bridge():
     running = Instrument(
         "-p",
         "port:=0",
-        machine_args=("--rate", "30", "--size", "256", "--image-every", "1"),
+        machine_args=("rate:=30.0", "size:=256", "image_every:=1"),
         module="mems6dof_ros.nodes.foxglove_bridge",
         says="Foxglove WebSocket: ",
     )
@@ -94,7 +94,7 @@ def test_a_taken_port_is_one_line(bridge):
     second = Instrument(
         "-p",
         f"port:={port}",
-        machine_args=("--seconds", "0"),
+        machine_args=None,
         module="mems6dof_ros.nodes.foxglove_bridge",
     )
     assert second.monitor.wait(20) == 1

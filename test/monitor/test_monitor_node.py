@@ -119,7 +119,7 @@ def test_services_are_called(instrument):
 
 def test_the_token_is_told_to_nobody_but_the_terminal(monkeypatch):
     monkeypatch.setenv("MEMS6DOF_MONITOR_TOKEN", "a token that stays here")
-    watched = Instrument("-p", "port:=0", machine_args=("--seconds", "0"))
+    watched = Instrument("-p", "port:=0", machine_args=None)
     try:
         assert watched.url.endswith("/?token=a%20token%20that%20stays%20here")
         tellers = [line for line in watched.lines if "token" in line]
@@ -134,7 +134,7 @@ def test_the_node_ends_in_good_order_and_refuses_bad_parameters(instrument):
     assert instrument.stop() == 0
     assert not any("Traceback" in line for line in instrument.lines)
     for parameter in ("port:=70000", "history:=5", "colour:=red"):
-        refused = Instrument("-p", parameter, machine_args=("--seconds", "0"))
+        refused = Instrument("-p", parameter, machine_args=None)
         assert refused.monitor.wait(20) == 1
         refused.stop()
         errors = [line for line in refused.lines if line.startswith("error: ")]

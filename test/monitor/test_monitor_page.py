@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mems6dof_ros.monitor.picture import make_picture
+from mems6dof_ros.pose.cycle_pose import Status
 
 playwright = pytest.importorskip("playwright.sync_api", reason="the browser test needs playwright")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -267,3 +268,65 @@ def test_memory_stays_flat_however_long_it_runs(serve, open_page, machine):
     print(f"heap {early:.1f} MB after 5000 cycles, {late:.1f} MB after 54000")
     assert length(page) <= 1000
     assert late - early < 1.5
+
+
+def test_an_empty_page_says_what_is_missing(serve, open_page, machine):
+    served = serve()
+    page = open_page(served.url)
+    served.feed.set_instrument({"rates": {"frame_info": 0.0, "localizations": 0.0, "pose_6dof": 0.0}})
+    wait_for_text(page, "status-name", "WAITING")
+    wait_for_text(page, "status-reason", "nothing is heard")
+    assert page.evaluate("document.querySelector('main').classList.contains('waiting')")
+    served.feed.set_instrument({"rates": {"frame_info": 90.0, "localizations": 0.0, "pose_6dof": 0.0}})
+    wait_for_text(page, "status-reason", "is localizer running?")
+    pose = machine.cycle(0, image=False)[2]
+    lost = replace(
+        pose, status=Status.LOST, reason="no particles seen", displacement=np.full(6, math.nan), cycle=1
+    )
+    served.feed.add_pose(lost)
+    wait_for_text(page, "status-name", "LOST")
+    wait_for_text(page, "status-reason", "no particles seen")
+    page.wait_for_selector("[data-quantity=dx] .plot[data-empty^='no valid pose']")
+    assert not page.evaluate("document.querySelector('main').classList.contains('waiting')")
+
+
+def test_the_controller_is_steered_where_there_is_one(serve, open_page, machine):
+    served = serve()
+    for number in range(20):
+        served.feed.add_pose(machine.cycle(number, image=False)[2])
+    page = open_page(served.url)
+    wait_for_cycles(page, 20)
+    assert page.is_hidden("#controller")
+    controller = {
+        "body": "load_gear",
+        "state": "moving",
+        "reason": "",
+        "target": 0.5,
+        "error": -0.0123,
+        "cycles": 4,
+        "limits": {"max_play": 3e-6, "max_tilt": 5e-3},
+    }
+    there = {"frame_source/stop": True, "controller/go": True, "controller/stop": True}
+    served.feed.set_instrument({"controller": controller, "services": there})
+    page.wait_for_selector("#controller", state="visible")
+    wait_for_text(page, "controller-state", "MOVING")
+    assert page.inner_text("#controller-error") == "\u221212.300 mrad"
+    assert page.inner_text("#controller-limits") == "stops beyond play 3 µm, tilt 5 mrad"
+    page.wait_for_function("mems6dof.charts.find((c) => c.key === 'psi').target() === 0.5")
+    page.fill("#controller-target", "not a number")
+    page.click("#controller-go")
+    page.fill("#controller-target", "-0,25")
+    page.click("#controller-go")
+    wait_for_text(page, "answer", "stopped")  # what the test's services answer to everything
+    page.select_option("#controller-unit", label="°")
+    page.fill("#controller-target", "90")
+    page.press("#controller-target", "Enter")
+    page.click("#controller-stop")
+    page.wait_for_function("() => document.getElementById('events').childElementCount >= 4")
+    assert served.called == ["controller/go -0.25", f"controller/go {math.pi / 2}", "controller/stop"]
+    served.feed.set_instrument({"controller": {**controller, "state": "stopped", "reason": "pose lost"}})
+    wait_for_text(page, "controller-state", "STOPPED")
+    assert page.inner_text("#controller-reason") == "pose lost"
+    served.feed.set_instrument({"services": {"controller/go": False, "controller/stop": False}})
+    wait_for_text(page, "controller-state", "NOT THERE")
+    assert page.is_disabled("#controller-go")

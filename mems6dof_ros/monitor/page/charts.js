@@ -70,6 +70,7 @@ export class CycleChart {
     this.data = null;
     this.yRange = [0, 1];
     this.detrended = false;
+    this.drawn = 0;
     const { label, name, color } = QUANTITIES[this.key];
     root.style.setProperty("--c", `var(--${color})`);
     root.innerHTML = `<div class="head"><span class="name"></span><span class="value"></span>
@@ -176,6 +177,9 @@ export class CycleChart {
       this.plot.setData([this.data.x, this.data.truth, this.data.y], false);
       this.plot.setScale("x", { min: low, max: Math.max(high, low + 1) });
     });
+    this.drawn++;
+    const empty = this.data.y.every((y) => y === null);
+    this.plotNode.dataset.empty = empty ? "no valid pose in these cycles" : "";
     this.readOut();
     if (this.legend) {
       const { aligned } = this.view;
@@ -200,8 +204,16 @@ export class CycleChart {
       }
     }
     if (least > most) [least, most] = [-1, 1];
+    const target = this.target();
+    if (target !== null) [least, most] = [Math.min(least, target), Math.max(most, target)];
     const room = Math.max((most - least) * 0.06, widest, 1e-9 * Math.abs(most) || 1e-9);
     this.yRange = [least - room, most + room];
+  }
+
+  // Where the controller goes, in the unit of this plot; null: nowhere, or not on this plot.
+  target() {
+    const { target } = this.view;
+    return this.key !== "psi" || this.detrended || target === null ? null : target * QUANTITIES.psi.scale;
   }
 
   drawBackground(u) {
@@ -235,19 +247,21 @@ export class CycleChart {
       i = j;
     }
     ctx.globalAlpha = 1;
-    const limit = this.view.limits.get(this.key);
-    if (limit && !this.detrended) {
-      ctx.strokeStyle = colour("alarm");
+    const rule = (y, name, dash) => {
+      ctx.strokeStyle = colour(name);
       ctx.lineWidth = devicePixelRatio;
-      ctx.setLineDash([7 * devicePixelRatio, 5 * devicePixelRatio]);
-      for (const bound of [limit.low, limit.high]) {
-        if (bound === null) continue;
-        ctx.beginPath();
-        ctx.moveTo(bbox.left, py(bound * QUANTITIES[this.key].scale));
-        ctx.lineTo(bbox.left + bbox.width, py(bound * QUANTITIES[this.key].scale));
-        ctx.stroke();
-      }
+      ctx.setLineDash(dash.map((length) => length * devicePixelRatio));
+      ctx.beginPath();
+      ctx.moveTo(bbox.left, py(y));
+      ctx.lineTo(bbox.left + bbox.width, py(y));
+      ctx.stroke();
+    };
+    const limit = this.detrended ? null : this.view.limits.get(this.key);
+    for (const bound of [limit?.low ?? null, limit?.high ?? null]) {
+      if (bound !== null) rule(bound * QUANTITIES[this.key].scale, "alarm", [7, 5]);
     }
+    const target = this.target();
+    if (target !== null) rule(target, "text", [2, 3]);
     ctx.restore();
   }
 

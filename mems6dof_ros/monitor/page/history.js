@@ -6,7 +6,8 @@ export class History {
     this.names = names;
     this.capacity = capacity;
     // Twice the room, so that a window of any length is one contiguous piece without copying.
-    this.columns = Object.fromEntries(names.map((name) => [name, new Float64Array(2 * capacity)]));
+    // Filled, so that all memory it will ever take is taken now.
+    this.columns = Object.fromEntries(names.map((name) => [name, new Float64Array(2 * capacity).fill(NaN)]));
     this.cycle = this.columns.cycle;
     this.clear();
   }

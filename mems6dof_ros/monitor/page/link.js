@@ -49,10 +49,15 @@ export class Link {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
-  call(service) {
+  // value: a number for the services that take one
+  call(service, value) {
     return new Promise((resolve) => {
+      if (this.socket.readyState !== WebSocket.OPEN) {
+        resolve({ success: false, message: "not connected" });
+        return;
+      }
       this.calls.set(++this.number, resolve);
-      this.send({ type: "call", id: this.number, service });
+      this.send({ type: "call", id: this.number, service, ...(value === undefined ? {} : { value }) });
     });
   }
 }

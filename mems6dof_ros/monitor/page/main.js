@@ -1,6 +1,7 @@
 // The live page: what is shown, and when it is drawn.
 
 import { CycleChart } from "./charts.js";
+import { setUpController, showController } from "./controller.js";
 import { exportCsv, exportPng } from "./export.js";
 import { History } from "./history.js";
 import { Link } from "./link.js";
@@ -23,7 +24,7 @@ let window_ = 400;  // cycles; 0: all
 let frozen = null;  // [low, high] cycles while zoomed or paused, else null: follow
 let paused = false;
 let fresh = false;
-const view = { history: null, low: 0, high: 1, limits: new Map() };
+const view = { history: null, low: 0, high: 1, limits: new Map(), target: null };
 
 // What comes in ------------------------------------------------------------------------------------
 
@@ -37,7 +38,7 @@ const link = new Link({
   hello(message) {
     hello = message;
     histories = new Map();
-    view.history = null;
+    showHistory();
     setUpLimits(hello.limitable, (request) => link.send(request));
     $("events").replaceChildren();
     wantPictures();
@@ -53,6 +54,10 @@ const link = new Link({
       view.limits = new Map(state.limits.map((limit) => [limit.quantity, limit]));
       showLimits(state.limits, (quantity) => link.send({ type: "remove_limit", quantity }));
       fresh = true;
+    }
+    if (changed("controller") || changed("services")) {
+      showController(state.controller, state.services);
+      showTarget();
     }
     if (changed("diagnostics")) showDiagnostics(state.diagnostics ?? []);
     if (changed("services")) {
@@ -73,8 +78,7 @@ const link = new Link({
       if (!histories.has(number_)) histories.set(number_, new History(names, hello.capacity));
       histories.get(number_).append(table, row);
     }
-    view.history = histories.get(body) ?? null;
-    fresh = true;
+    showHistory();
   },
   picture(overlay, jpeg) { if (!paused) micrograph.setPicture(overlay, jpeg); },
 });
@@ -142,13 +146,26 @@ function showBodies() {
     select.replaceChildren(...state.bodies.map((b) => new Option(b.name, b.number, false, b.number === body)));
   }
 }
+function showHistory() {
+  view.history = histories.get(body) ?? null;
+  document.querySelector("main").classList.toggle("waiting", !view.history?.length);
+  fresh = true;
+}
+
+// Where the controller takes the body that is shown; null: nowhere.
+function showTarget() {
+  const { controller } = state;
+  view.target = controller && controller.body === bodyName() ? controller.target : null;
+  fresh = true;
+}
 const bodyName = () => state?.bodies.find((b) => b.number === body)?.name ?? "body";
 
 // What the user does -------------------------------------------------------------------------------
 
 $("body").onchange = () => {
   body = micrograph.body = Number($("body").value);
-  view.history = histories.get(body) ?? null;
+  showHistory();
+  showTarget();
   showStatus(open, state, body);
   micrograph.draw();
   redraw();
@@ -199,19 +216,23 @@ for (const what of ["particles", "identities", "residuals"]) {
   };
 }
 
+async function call(service, value) {
+  const { success, message } = await link.call(service, value);
+  $("answer").textContent = `${success ? "✓" : "✗"} ${message || service}`;
+  $("answer").title = message;
+}
+
 const serviceButtons = [...document.querySelectorAll("[data-service]")];
 for (const button of serviceButtons) {
   button.disabled = true;
   button.onclick = async () => {
-    const service = button.dataset.service;
     if ("confirm" in button.dataset && !confirm(`${button.title}?`)) return;
     button.classList.add("busy");
-    const { success, message } = await link.call(service);
+    await call(button.dataset.service);
     button.classList.remove("busy");
-    $("answer").textContent = `${success ? "✓" : "✗"} ${message || service}`;
-    $("answer").title = message;
   };
 }
+setUpController(call);
 
 function setTheme(theme) {
   document.documentElement.dataset.theme = theme;
@@ -236,6 +257,7 @@ document.addEventListener("keydown", (event) => {
 
 showLimits([], () => {});
 showDiagnostics([]);
+showHistory();
 setWindow(window_);
 requestAnimationFrame(tick);
 

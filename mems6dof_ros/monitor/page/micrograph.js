@@ -91,7 +91,10 @@ export class Micrograph {
     ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
     ctx.fillStyle = "#05070a";
     ctx.fillRect(0, 0, width, height);
-    if (!overlay) return;
+    if (!overlay) {
+      this.say(ctx, "Waiting for frames", "shown while the instrument measures");
+      return;
+    }
     const { scale, left, top } = this.geometry();
     if (this.bitmap) {
       ctx.imageSmoothingEnabled = scale * overlay.width / this.bitmap.width < 4;
@@ -101,7 +104,22 @@ export class Micrograph {
       ctx.strokeRect(left, top, overlay.width * scale, overlay.height * scale);
     }
     this.drawScales(ctx, this.drawParticles(ctx));
+    if (overlay.x_px?.length === 0) this.say(ctx, "No particle found", `in cycle ${overlay.cycle}`);
     this.drawn++;
+  }
+
+  // Words in the middle, where there is nothing else to see.
+  say(ctx, headline, detail) {
+    const x = this.canvas.clientWidth / 2, y = this.canvas.clientHeight / 2;
+    ctx.textAlign = "center";
+    ctx.textBaseline = "middle";
+    ctx.fillStyle = INK;
+    ctx.font = font(1.15, 600);
+    ctx.fillText(headline, x, y - 12);
+    ctx.fillStyle = "#93a0af";
+    ctx.font = font(0.9);
+    ctx.fillText(detail, x, y + 12);
+    ctx.textAlign = "left";
   }
 
   // Returns the length of a residual on the screen, px per m.

@@ -15,7 +15,7 @@ const STAGES = {
   latency_pose: "pose",
 };
 
-function text(node, value) {
+export function text(node, value) {
   if (node.textContent !== value) node.textContent = value;
 }
 
@@ -35,14 +35,21 @@ function row(level, ...content) {
 
 export function showStatus(open, state, body) {
   const known = state?.bodies.find((b) => b.number === body);
-  let { name, level } = STATUS[known?.status] ?? { name: "NO POSES YET", level: "idle" };
-  let reason = known?.reason ?? "";
+  let { name, level } = STATUS[known?.status] ?? { name: "WAITING", level: "idle" };
+  let reason = known ? known.reason : state ? missing(state.rates) : "";
   if (!open) [name, level, reason] = ["OFFLINE", "alarm", "the monitor does not answer"];
   else if (known && state.stale > STALE_S) [name, level, reason] = ["STALE", "warning", `no pose for ${Math.round(state.stale)} s`];
   $("status").dataset.level = level;
   text($("status-name"), name);
   text($("status-reason"), reason);
   document.title = `${name} – mems6dof`;
+}
+
+// What the instrument lacks, where there is no pose.
+function missing(rates) {
+  if (rates?.localizations) return "particles are found, but no poses come: is pose_estimator running?";
+  if (rates?.frame_info) return "frames come, but nothing is found on them: is localizer running?";
+  return "nothing is heard: is the instrument running, in this ROS domain and namespace?";
 }
 
 export function showFigures(history, state) {
@@ -127,20 +134,30 @@ export function showLimits(limits, remove) {
   const chip = $("alarm-chip");
   chip.hidden = !active;
   text(chip, `${active} alarm${active > 1 ? "s" : ""}`);
-  const nodes = limits.map((limit) => {
-    const { name, unit, scale, digits } = QUANTITIES[limit.quantity];
+  const root = $("limits");
+  // Made anew only where limits come or go: their counts change with every cycle, and a button that is
+  // replaced between press and release never hears of either.
+  const names = limits.map((limit) => limit.quantity).join();
+  if (root.dataset.names !== names) {
+    root.dataset.names = names;
+    root.replaceChildren(...limits.map(({ quantity }) => {
+      const button = element("button", "", "×");
+      button.title = "Remove this limit";
+      button.onclick = () => remove(quantity);
+      return row("idle", element("span", "", QUANTITIES[quantity].name), element("span"), element("span", "muted"), button);
+    }));
+    if (!limits.length) root.append(element("div", "muted", "No limits set."));
+  }
+  limits.forEach((limit, i) => {
+    const { unit, scale, digits } = QUANTITIES[limit.quantity];
     const bound = (v, open) => v === null ? open : number(v * scale, Math.min(digits, 3));
-    const range = `${bound(limit.low, "any")} to ${bound(limit.high, "any")} ${unit}`;
     const state = limit.active ? "ALARM" : limit.count ? "within again" : "kept";
     const count = limit.count ? `, ${limit.count} cycle${limit.count > 1 ? "s" : ""} outside` : "";
-    const button = element("button", "", "×");
-    button.title = "Remove this limit";
-    button.onclick = () => remove(limit.quantity);
-    return row(limit.active ? "alarm" : limit.count ? "warning" : "good", element("span", "", name),
-      element("span", "", range), element("span", "muted", state + count), button);
+    const node = root.children[i];
+    node.dataset.level = limit.active ? "alarm" : limit.count ? "warning" : "good";
+    text(node.children[2], `${bound(limit.low, "any")} to ${bound(limit.high, "any")} ${unit}`);
+    text(node.children[3], state + count);
   });
-  if (!nodes.length) nodes.push(element("div", "muted", "No limits set."));
-  $("limits").replaceChildren(...nodes);
 }
 
 export function showDiagnostics(diagnostics) {

@@ -1,31 +1,33 @@
-"""A made-up turning gear that publishes real messages: no optics and no estimation, only their traffic.
+"""A made-up turning gear, to watch: what an instrument says of it, without optics and estimation.
 
-Run as a script it is a ROS node with the topics and services of the instrument:
-
-    python synthetic.py --rate 90 --size 1024 --image-every 9 --seconds 60
+Nothing is measured here, so nothing of it tells how well the instrument measures.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mems6dof_ros.frame import Frame, GroundTruth
 from mems6dof_ros.localization.localizations import GaussianFits, Latency, Localizations
 from mems6dof_ros.pose.angles import from_swing_twist, paper_angles
 from mems6dof_ros.pose.cycle_pose import CyclePose, Status
 
+Array = NDArray[np.float64]
+
+#: rad per cycle; standard deviations of the poses, m and rad; width of the field, m.
 STEP = math.radians(4.5)
 SD = np.array([0.25e-9, 0.25e-9, 7e-9, 95e-6, 95e-6, 2.5e-6])
 FIELD = 260e-6
+_BACKGROUNDS = 4  # different ones: noise costs more than all particles
 
 
 class Machine:
-    """Gear with run-out, wobble, play and step errors; ``cycle(n)`` gives its core types."""
+    """Gear with run-out, wobble, play and step errors, lost now and then; ``size`` px of its images."""
 
     def __init__(self, seed: int = 1, size: int = 1024, particles: int = 110) -> None:
         self.rng = np.random.default_rng(seed)
@@ -39,6 +41,7 @@ class Machine:
         self.psi = 0.0
         self.previous = np.zeros(6)
         self.lost_until = -1
+        self._backgrounds: list[NDArray[np.float32]] = []
 
     def cycle(self, number: int, *, image: bool = True) -> tuple[Frame, Localizations, CyclePose]:
         """Everything one motion cycle gives; call in the order of cycles."""
@@ -88,7 +91,9 @@ class Machine:
         )
         return frame, *self._measure(number, now, true, inside, position[inside], pixel[inside])
 
-    def _measure(self, number, now, true, inside, position, pixel):
+    def _measure(
+        self, number: int, now: int, true: Array, inside: NDArray[np.intp], position: Array, pixel: Array
+    ) -> tuple[Localizations, CyclePose]:
         rng, n = self.rng, len(inside)
         residual = rng.normal(0, 1, (n, 3)) * [2.2e-9, 2.2e-9, 40e-9]
         residual[rng.random(n) < 0.03] *= 4
@@ -182,8 +187,10 @@ class Machine:
         self.previous = measured
         return localizations, pose
 
-    def _render(self, pixel, z, brightness):
-        image = self.rng.normal(110, 3.5, (self.size, self.size)).astype(np.float32)
+    def _render(self, pixel: Array, z: Array, brightness: Array) -> NDArray[np.uint16]:
+        if len(self._backgrounds) < _BACKGROUNDS:
+            self._backgrounds.append(self.rng.normal(110, 3.5, (self.size, self.size)).astype(np.float32))
+        image = self._backgrounds[self.rng.integers(len(self._backgrounds))].copy()
         scale = self.size / 2048
         half = max(int(16 * scale), 4)
         for (x, y), height, electrons in zip(pixel, z, brightness, strict=True):
@@ -196,82 +203,3 @@ class Machine:
                 -((ys[:, None] - y) ** 2 + (xs - x) ** 2) / (2 * sigma**2)
             )
         return np.clip(image, 0, 4095).astype(np.uint16)
-
-
-def main() -> None:
-    import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-    from rclpy.qos import QoSProfile
-    from sensor_msgs.msg import Image
-    from std_srvs.srv import Trigger
-
-    from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
-    from mems6dof_ros.recording import messages
-
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--rate", type=float, default=90.0)
-    parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--image-every", type=int, default=9)
-    parser.add_argument("--seconds", type=float, default=1e9)
-    options = parser.parse_args()
-
-    rclpy.init()
-    node = rclpy.create_node("synthetic")
-    machine = Machine(size=options.size)
-    qos = QoSProfile(depth=64)
-    publishers = {
-        topic: node.create_publisher(kind, topic, qos)
-        for topic, kind in {
-            "frame_info": FrameInfo,
-            "image_raw": Image,
-            "truth": GroundTruth,
-            "localizations": Localizations,
-            "pose_6dof": Pose6DOF,
-        }.items()
-    }
-    diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", qos)
-    running = [True]
-
-    def service(name, effect):
-        def answer(_, response):
-            effect()
-            response.success, response.message = True, f"{name} done"
-            return response
-
-        node.create_service(Trigger, name, answer)
-
-    service("frame_source/start", lambda: running.__setitem__(0, True))
-    service("frame_source/stop", lambda: running.__setitem__(0, False))
-    service("pose_estimator/set_reference", lambda: None)
-    service("recorder/start", lambda: None)
-
-    number, next_diagnostics = 0, 0.0
-    started = due = time.monotonic()
-    while rclpy.ok() and time.monotonic() - started < options.seconds:
-        rclpy.spin_once(node, timeout_sec=max(due - time.monotonic(), 0))
-        now = time.monotonic()
-        if now >= next_diagnostics:
-            next_diagnostics = now + 1
-            status = DiagnosticStatus(level=b"\x00", name="localizer: frames", message="90.0 frames/s")
-            status.values = [KeyValue(key="queue", value="0"), KeyValue(key="fits_per_second", value="8600")]
-            disk = DiagnosticStatus(level=b"\x01", name="recorder: disk", message="12 GB left, 9 minutes")
-            diagnostics.publish(DiagnosticArray(status=[status, disk]))
-        if now < due or not running[0]:
-            due = max(due, now - 0.1) if running[0] else now + 0.05
-            continue
-        due += 1 / options.rate
-        with_image = options.image_every > 0 and number % options.image_every == 0
-        frame, found, pose = machine.cycle(number, image=with_image)
-        publishers["frame_info"].publish(messages.to_rclpy(messages.frame_info(frame)))
-        if with_image:
-            publishers["image_raw"].publish(messages.to_rclpy(messages.image(frame)))
-        for truth in messages.ground_truths(frame):
-            publishers["truth"].publish(messages.to_rclpy(truth))
-        publishers["localizations"].publish(messages.to_rclpy(messages.localizations(found)))
-        publishers["pose_6dof"].publish(messages.to_rclpy(messages.pose6dof(pose)))
-        number += 1
-    rclpy.try_shutdown()
-
-
-if __name__ == "__main__":
-    main()

@@ -19,7 +19,8 @@ from mems6dof_ros.nodes import transport
 class Health:
     """Counts and times of a node, published on /diagnostics once per second; safe for any thread.
 
-    The level is WARN while something was lost, ERROR while something was refused, in the last second.
+    The level is WARN while something was lost, ERROR while something was refused, in the last second, and
+    ERROR as long as ``failure`` says what keeps the node from its work.
     """
 
     PERIOD = 1.0  # s
@@ -28,6 +29,7 @@ class Health:
     def __init__(self, node: Node) -> None:
         self.lifecycle = "unconfigured"  # label of the state of a managed node
         self.state = ""  # what it does there
+        self.failure = ""  # what keeps it from that until somebody helps
         self._node = node
         self._lock = threading.Lock()
         self._totals: dict[str, int] = defaultdict(int)
@@ -106,6 +108,8 @@ class Health:
         values.update({what: str(read()) for what, read in self._gauges.items()})
         values["lifecycle"] = self.lifecycle
         state = f"{self.lifecycle}: {self.state}" if self.state else self.lifecycle
+        if self.failure:
+            problems = [(DiagnosticStatus.ERROR, self.failure)]
         level, message = max(problems, default=(DiagnosticStatus.OK, state), key=lambda p: p[0])
         status = DiagnosticStatus(
             level=level,

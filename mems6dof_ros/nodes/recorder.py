@@ -1,19 +1,22 @@
 """``recorder``: topics to a bag (rosbag2, MCAP) as they come over the wire, without decoding them.
 
 Services (std_srvs/Trigger): ``~/start`` begins a new bag, and brings the node up if need be, ``~/stop``
-completes it, as deactivation does. What a publisher had sent before the node was told to end is still
-written.
+completes it, as deactivation does, ``~/split`` goes on in a new file of it. What a publisher had sent before
+the node was told to end is still written. Attached to the bag are the files that the parameters name, and the
+parameters of the nodes that publish what is recorded.
 """
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import functools
 import importlib
+import shutil
 import sys
-import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +29,7 @@ from std_srvs.srv import Trigger
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import InstrumentNode, WhileRoom, run
+from mems6dof_ros.nodes.parameter_files import ParameterReader, parameter_file
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
@@ -50,9 +54,13 @@ KNOWN_TYPES = {
 #: Recorded unless asked otherwise: everything but the images, which need the disk's own rate.
 DEFAULT_TOPICS = tuple(name for name in KNOWN_TYPES if name != topics.IMAGE)
 
-#: A message on one of these completes a motion cycle: what has been recorded so far is flushed.
-_CYCLE_TYPES = ("mems6dof_msgs/msg/Pose6DOF",)
+#: A message of one of these types completes a motion cycle, upon which what has been recorded so far is
+#: flushed: of those that come, the first in this order.
+_CYCLE_TYPES = ("mems6dof_msgs/msg/Pose6DOF", "mems6dof_msgs/msg/Localizations", "sensor_msgs/msg/Image")
+_FLUSH_PERIOD = 1.0  # s after which it is flushed without one
 _QUIET = 0.1  # s without a message after which nothing is expected any more
+_LATCHED = 10  # messages of a transient-local topic that stand at the beginning of every file
+_MEBIBYTE = 2**20
 
 PARAMETERS = (
     Parameter("topics", DEFAULT_TOPICS, "Topics to record; a type that is unknown here is waited for."),
@@ -64,6 +72,27 @@ PARAMETERS = (
         choices=tuple(COMPRESSIONS),
     ),
     Parameter("sync_period", 1.0, "What is older survives a loss of power.", "s", (0.01, 3600.0)),
+    Parameter(
+        "split_mebibytes",
+        0,
+        "Size after which a new file is begun, between two motion cycles; 0: never.",
+        "MiB",
+        (0, 1_000_000_000),
+    ),
+    Parameter(
+        "split_duration",
+        600.0,
+        "Time after which a new file is begun; 0.0: never. The index of a file is kept in memory.",
+        "s",
+        (0.0, 1e9),
+    ),
+    Parameter(
+        "minimum_free_mebibytes",
+        256,
+        "The bag is completed and ended before less is left on the disk.",
+        "MiB",
+        (0, 1_000_000_000),
+    ),
     Parameter("attachments", (), "Files to attach to the bag, for instance the calibration."),
     START_PAUSED,
     Parameter("queue_mebibytes", 512, "Messages that wait for the disk.", "MiB", (1, 1_000_000)),
@@ -91,12 +120,19 @@ class RecorderNode(InstrumentNode):
     def __init__(self) -> None:
         super().__init__("recorder", PARAMETERS)
         self._bag: BagWriter | None = None
+        self._failed: BagWriter | None = None
         self._bags = 0
+        self._closing: Future | None = None  # of the last bag
+        #: What is to be done after a flush, and told when done with the file that was the last before.
+        self._between: deque[tuple[Callable[[BagWriter], None], Future]] = deque()
+        self._cycle_types: tuple[str, ...] = _CYCLE_TYPES  # that still count
         self._flushed = 0.0
         self._sequences: dict[str, int] = {}
         self.create_service(Trigger, "~/start", self._on_start)
-        # In a group of its own: it waits for messages that come meanwhile.
-        self.create_service(Trigger, "~/stop", self._on_stop, callback_group=MutuallyExclusiveCallbackGroup())
+        # In groups of their own: they wait for messages that come meanwhile.
+        for name, act in (("stop", self._on_stop), ("split", self._on_split)):
+            group = MutuallyExclusiveCallbackGroup()
+            self.create_service(Trigger, f"~/{name}", act, callback_group=group)
 
     def configure(self) -> None:
         for path in self.values["attachments"]:
@@ -104,12 +140,14 @@ class RecorderNode(InstrumentNode):
                 raise InputError("parameter attachments", f"no file '{path}'", "existing files")
 
     def activate(self) -> None:
+        self._reader = ParameterReader(self)
         if not self.values["start_paused"]:
             self._open()
-        self._dropped = 0
-        capacity = self.values["queue_mebibytes"] * 2**20
+        self._dropped = self._bytes = 0
+        capacity = self.values["queue_mebibytes"] * _MEBIBYTE
         self.start_worker(lambda act: act(), capacity)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._channels: list[Channel] = []
         self._unknown = [name for name in self.values["topics"] if not self._subscribe_known(name)]
         if self._unknown:
             self._looking = self.create_timer(0.2, self._look_for_types, clock=steady)
@@ -120,7 +158,10 @@ class RecorderNode(InstrumentNode):
         assert self.worker is not None
         self.worker.end(timeout=None)  # a slow disk is no reason to lose a record; a second signal is
         super().deactivate()
-        self._close()
+        bag, self._bag = self._bag, None
+        if bag:
+            self._close(bag)
+        self.health.failure = ""
 
     def end(self, spin: Callable[[float], None]) -> None:
         deadline = time.monotonic() + DRAIN_TIMEOUT
@@ -148,11 +189,11 @@ class RecorderNode(InstrumentNode):
                 continue
             self._unknown.remove(name)
             offered = [info.qos_profile for info in self.get_publishers_info_by_topic(resolved)]
-            qos = QoSProfile(depth=transport.MESSAGES.depth)
+            qos = QoSProfile(depth=transport.MESSAGES.depth)  # by the wire nobody learns the publishers'
             if any(profile.reliability == ReliabilityPolicy.BEST_EFFORT for profile in offered):
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
             if offered and all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered):
-                qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+                qos.durability, qos.depth = DurabilityPolicy.TRANSIENT_LOCAL, _LATCHED
             try:
                 self._subscribe(name, types[resolved][0], qos)
             except (InputError, ImportError, AttributeError) as error:
@@ -171,6 +212,7 @@ class RecorderNode(InstrumentNode):
             else "volatile",
         )
         channel = Channel(self.resolve_topic_name(name), typename, (offered,))
+        self._channels.append(channel)
         receive = functools.partial(self._on_message, channel)
         assert self.worker is not None
         group = WhileRoom(self.worker)
@@ -189,7 +231,7 @@ class RecorderNode(InstrumentNode):
         )
         self.health.count("messages")
         self._account(received)
-        self.worker.put(functools.partial(self._write, received), len(data))
+        self.worker.put(functools.partial(self._write, self._bag, received), len(data))
 
     def _account(self, received: _Received) -> None:
         """Count what the wire lost; with several publishers on a topic the numbers do not tell."""
@@ -201,101 +243,154 @@ class RecorderNode(InstrumentNode):
 
     # The worker ---------------------------------------------------------------------------------
 
-    def _write(self, received: _Received) -> None:
-        if self._bag is None:
-            return
-        try:
-            self._bag.add_channel(*received.channel)
-            self._bag.write(*received)
-            self.health.count("bytes", len(received.data))
-            if received.channel.type in _CYCLE_TYPES:
-                self._bag.flush()
-        except OSError as error:
-            self._fail(error)
+    def _write(self, bag: BagWriter, received: _Received) -> None:
+        if bag is not self._failed:
+            with self._failing(bag):
+                bag.add_channel(*received.channel)
+                bag.write(*received)
+                self.health.count("bytes", len(received.data))
+                if self._completes_cycle(received) or time.monotonic() - self._flushed > _FLUSH_PERIOD:
+                    self._flush(bag)
 
-    def _flush(self) -> None:
-        """What comes without a motion cycle, once per second."""
-        try:
-            if self._bag:
-                self._bag.flush()
-        except OSError as error:
-            self._fail(error)
+    def _completes_cycle(self, received: _Received) -> bool:
+        if received.channel.type not in self._cycle_types:
+            return False
+        self._cycle_types = self._cycle_types[: 1 + self._cycle_types.index(received.channel.type)]
+        return received.channel.type == self._cycle_types[-1]
 
-    def _fail(self, error: OSError) -> None:
+    def _flush(self, bag: BagWriter) -> None:
+        if bag is not self._failed:
+            with self._failing(bag):
+                bag.flush()
+                self._flushed = time.monotonic()
+                self._do_between(bag)
+
+    def _close(self, bag: BagWriter) -> None:
+        if bag is not self._failed:
+            with self._failing(bag):
+                self._do_between(bag)
+                bag.close()
+        self.get_logger().info(f"{bag.message_count} messages in {bag.path}")
+
+    def _do_between(self, bag: BagWriter) -> None:
+        while self._between:
+            act, done = self._between[0]
+            path = bag.file
+            act(bag)
+            self._between.popleft()
+            done.set_result(path)
+
+    @contextlib.contextmanager
+    def _failing(self, bag: BagWriter) -> Iterator[None]:
         """The measurement goes on without its record, and says so."""
-        assert self._bag is not None
-        self.health.refused(f"recording stopped: {self._bag.path}: {error.strerror}")
-        self.health.state = "stopped by an error"
-        self._bag = None
+        try:
+            yield
+        except OSError as error:
+            self._bag, self._failed = None, bag
+            self.health.failure = f"recording stopped: {bag.path}: {error.strerror or error}"
+            self.health.refused(self.health.failure)
+            while self._between:
+                self._between.popleft()[1].set_result(None)
 
     # Begin and end ------------------------------------------------------------------------------
 
     def _on_second(self) -> None:
         assert self.worker is not None
-        if len(self.worker) == 0:
-            self.worker.put(self._flush)
+        bag = self._bag
+        if bag and len(self.worker) == 0:  # what comes without a motion cycle
+            self.worker.put(functools.partial(self._flush, bag), 0)
         dropped, self._dropped = self.worker.dropped - self._dropped, self.worker.dropped
         if dropped:
             self.health.lost(dropped, f"{dropped} messages lost: the disk does not keep up")
+        if bag:
+            self._tell_of_disk(bag)
+            for name, text in self._reader.look([channel.topic for channel in self._channels]):
+                self._between.append((functools.partial(_attach, name=name, text=text), Future()))
+
+    def _tell_of_disk(self, bag: BagWriter) -> None:
+        free = shutil.disk_usage(bag.path).free - self.values["minimum_free_mebibytes"] * _MEBIBYTE
+        before, self._bytes = self._bytes, self.health.total("bytes")
+        self.health.set("file", bag.file)
+        self.health.set("disk, MiB left to record", free // _MEBIBYTE)
+        if self._bytes > before:
+            self.health.set("disk, min until it is full", round(free / (self._bytes - before) / 60.0))
 
     def _open(self) -> None:
         path = self.values["output"] or f"recording_{datetime.datetime.now():%Y%m%d_%H%M%S}"
         if self._bags and self.values["output"]:
             path += f"_{self._bags}"
+        needed = self.values["minimum_free_mebibytes"] * _MEBIBYTE
+        try:
+            Path(path).mkdir(parents=True, exist_ok=True)
+            if (free := shutil.disk_usage(path).free) < needed:
+                found = f"{free // _MEBIBYTE} MiB left on its disk"
+                raise InputError(path, found, f"{needed // _MEBIBYTE} MiB (minimum_free_mebibytes)")
+            bag = BagWriter(
+                path,
+                compression=self.values["compression"],
+                provenance={"topics": " ".join(self.values["topics"])},
+                sync_period=self.values["sync_period"],
+                split_size=self.values["split_mebibytes"] * _MEBIBYTE,
+                split_duration=self.values["split_duration"],
+                minimum_free=needed,
+            )
+            for attachment in map(Path, self.values["attachments"]):
+                bag.attach(attachment.name, attachment.read_bytes())
+            _attach(bag, *parameter_file(self.get_fully_qualified_name(), self.values))
+        except OSError as error:
+            raise InputError(path, error.strerror or str(error), "a directory to record to") from None
         self._bags += 1
-        provenance = {name: str(self.values[name]) for name in ("topics", "compression", "sync_period")}
-        bag = BagWriter(
-            path,
-            compression=self.values["compression"],
-            provenance=provenance,
-            sync_period=self.values["sync_period"],
-        )
-        for attachment in map(Path, self.values["attachments"]):
-            bag.attach(attachment.name, attachment.read_bytes())
         self._sequences.clear()
+        self._reader.forget()
+        self._cycle_types = _CYCLE_TYPES
         self._bag = bag
 
-    def _close(self) -> None:
-        bag, self._bag = self._bag, None
-        if bag:
-            bag.close()
-            self.get_logger().info(f"{bag.message_count} messages in {bag.path}")
-
     def _on_start(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._bag:
-            response.success, response.message = False, f"already recording to {self._bag.path}"
+        if self._bag or (self._closing and not self._closing.done()):
+            path = self._bag.path if self._bag else "the last bag"
+            response.success, response.message = False, f"already recording to {path}"
             return response
         try:
             self.bring_up()
             if self._bag is None:
                 self._open()
-        except (Mems6dofError, OSError) as error:
+        except Mems6dofError as error:
             response.success, response.message = False, str(error)
             return response
         assert self._bag is not None
+        self.health.failure = ""
         self.tell("recording")
         response.success, response.message = True, str(self._bag.path)
         return response
 
     async def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self._bag:
-            response.success, response.message = False, "not recording"
+            response.success, response.message = False, self.health.failure or "not recording"
             return response
-        path = self._bag.path
         await self._quiet()  # what was sent before this call may still be on its way through our callbacks
-        closed = threading.Event()
+        bag, self._bag = self._bag, None
+        if bag and self.worker is not None:  # not failed or deactivated meanwhile
+            self._closing = closing = Future()
 
-        def close() -> None:
-            self._close()
-            closed.set()
+            def close() -> None:
+                self._close(bag)
+                closing.set_result(None)
 
-        if self.worker is None:  # deactivated meanwhile, which has closed it
-            response.success, response.message = True, str(path)
-            return response
-        self.worker.put(close)  # behind what is queued
-        response.success = closed.wait(DRAIN_TIMEOUT)
-        response.message = str(path) if response.success else f"{path}: the disk is behind, still writing"
+            self.worker.put(close, 0)  # behind what is queued, of which no more comes
+            await closing
+        response.success, response.message = not self.health.failure, self.health.failure or str(bag.path)
         self.tell("stopped")
+        return response
+
+    async def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._bag is None or self.worker is None:
+            response.success, response.message = False, self.health.failure or "not recording"
+            return response
+        completed = Future()
+        self._between.append((BagWriter.split, completed))
+        self.worker.put(functools.partial(self._flush, self._bag), 0)
+        path = await completed
+        response.success, response.message = path is not None, str(path or self.health.failure)
         return response
 
     def _quiet(self) -> Future:
@@ -312,6 +407,10 @@ class RecorderNode(InstrumentNode):
 
         timer = self.create_timer(_QUIET, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
         return quiet
+
+
+def _attach(bag: BagWriter, name: str, text: str) -> None:
+    bag.attach(name, text.encode(), "application/yaml")
 
 
 def main(args: list[str] | None = None) -> int:

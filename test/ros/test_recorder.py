@@ -1,0 +1,137 @@
+"""The recorder: files that follow each other, what is attached to them, and the end of the disk."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from peers import NodeProcess, Peer
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from mems6dof_msgs.msg import Pose6DOF
+from mems6dof_ros.analysis.check import check_bag
+from mems6dof_ros.recording.bag import BagReader
+
+Start = Callable[..., NodeProcess]
+
+
+def parameters(*assignments: str) -> list[str]:
+    """As ROS arguments."""
+    return [part for assignment in assignments for part in ("-p", assignment)]
+
+
+def test_files_follow_each_other_at_a_call(start: Start, peer: Peer, tmp_path: Path) -> None:
+    """With what was latched repeated, and the parameters of who publishes attached to each."""
+    peer.node.declare_parameters("", [("exposure", 5e-3), ("lens.name", "20x 0.5"), ("list", [1, 2])])
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    names = [peer.node.create_publisher(String, f"name_{k}", latched) for k in range(2)]
+    for k, name in enumerate(names):
+        name.publish(String(data=f"before {k}"))
+    output = tmp_path / "bag"
+    node = start("recorder", *parameters(f"output:={output}", "topics:=[name_0, name_1, pose_6dof]"))
+    poses = peer.publisher(Pose6DOF, "pose_6dof")
+    peer.wait(lambda: all(name.get_subscription_count() for name in names))
+    peer.listen(DiagnosticArray, "/diagnostics")
+    peer.wait(lambda: any("disk, MiB left to record" in texts(m) for m in peer.received["/diagnostics"]))
+    time.sleep(2.5)  # the recorder asks for parameters in three steps, one per second
+    completed = []
+    for number in range(3):
+        for k in range(5):
+            poses.publish(Pose6DOF(cycle=5 * number + k))
+        if number == 1:
+            names[0].publish(String(data="after"))
+        time.sleep(0.5)  # a service does not wait for messages
+        if number < 2:
+            answer = peer.call(Trigger, "recorder/split")
+            assert answer.success, answer.message
+            completed.append(answer.message)
+    assert node.stop() == 0, node.output
+    assert completed == [str(output / f"bag_{k}.mcap") for k in range(2)]
+    assert check_bag(output).topics["/pose_6dof"] == ("mems6dof_msgs/msg/Pose6DOF", 15)
+    named = [{"before 0", "before 1"}, {"before 0", "after", "before 1"}, {"before 0", "after", "before 1"}]
+    for k in range(3):
+        with BagReader(output / f"bag_{k}.mcap") as bag:
+            cycles = [r.message.cycle for r in bag.messages(["/pose_6dof"])]
+            assert {r.message.data for r in bag.messages(["/name_0", "/name_1"])} == named[k]
+            attached = bag.attachments()
+        assert cycles == list(range(5 * k, 5 * k + 5))
+        own = yaml.safe_load(attached["parameters/recorder.yaml"])["/recorder"]["ros__parameters"]
+        assert own["output"] == str(output)
+        theirs = yaml.safe_load(attached["parameters/peer.yaml"])["/peer"]["ros__parameters"]
+        assert (theirs["exposure"], theirs["lens.name"], theirs["list"]) == (5e-3, "20x 0.5", [1, 2])
+
+
+def texts(message: DiagnosticArray) -> dict[str, str]:
+    """What the recorder says in it."""
+    return {
+        value.key: value.value
+        for status in message.status
+        if status.name == "recorder"
+        for value in status.values
+    }
+
+
+def test_without_room_it_does_not_begin(start: Start, tmp_path: Path) -> None:
+    node = start("recorder", *parameters(f"output:={tmp_path / 'bag'}", "minimum_free_mebibytes:=1000000000"))
+    assert node.wait() == 1
+    (line,) = [line for line in node.lines if "error" in line]
+    assert re.search(r"bag: found \d+ MiB left on its disk; expected 1000000000 MiB", line)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 3 MiB."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(path)], capture_output=True, text=True
+    )
+    if mount.returncode:
+        pytest.skip(f"no disk of one's own here: {mount.stderr.strip()}")
+    yield path
+    subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+def test_a_full_disk_ends_the_record_and_says_so(start: Start, peer: Peer, small_disk: Path) -> None:
+    """What was written is a whole bag, nobody is held up, and with new room it records again."""
+    arguments = [f"output:={small_disk / 'bag'}", "minimum_free_mebibytes:=1", "topics:=[pose_6dof]"]
+    node = start("recorder", *parameters(*arguments))
+    peer.listen(DiagnosticArray, "/diagnostics")
+    poses = peer.publisher(Pose6DOF, "pose_6dof")
+    reason = "x" * 10_000
+    for cycle in itertools.count():
+        poses.publish(Pose6DOF(cycle=cycle, reason=reason))
+        if "recording stopped" in node.output:
+            break
+        time.sleep(0.002)
+
+    def levels() -> list[bytes]:
+        mine = [s for m in peer.received["/diagnostics"] for s in m.status if s.name == "recorder"]
+        return [s.level for s in mine if "almost full" in s.message]
+
+    peer.wait(lambda: levels().count(DiagnosticStatus.ERROR) >= 3)  # until somebody helps
+    with BagReader(small_disk / "bag") as bag:
+        found = [recorded.message.cycle for recorded in bag.messages()]
+    assert len(found) > 150
+    assert found == list(range(found[0], found[0] + len(found)))
+    assert not peer.call(Trigger, "recorder/split").success
+    answer = peer.call(Trigger, "recorder/start")
+    assert not answer.success
+    assert "MiB left" in answer.message
+    for file in (small_disk / "bag").iterdir():
+        file.unlink()
+    assert peer.call(Trigger, "recorder/start").success
+    poses.publish(Pose6DOF(cycle=1))
+    time.sleep(0.5)
+    assert peer.call(Trigger, "recorder/stop").success
+    assert check_bag(small_disk / "bag_1").topics["/pose_6dof"] == ("mems6dof_msgs/msg/Pose6DOF", 1)
+    assert node.stop() == 0

@@ -48,10 +48,15 @@ class Message:
 # Builders, one per world ------------------------------------------------------------------------
 
 
+def rclpy_type(name: str) -> Any:
+    """The generated Python class of ``package/msg/Name``."""
+    module, name = name.rsplit("/", 1)
+    return getattr(importlib.import_module(module.replace("/", ".")), name)
+
+
 def to_rclpy(message: Message) -> Any:
     """The message as an instance of its generated Python class, ready for ``publish``."""
-    module, name = message.type.rsplit("/", 1)
-    result = getattr(importlib.import_module(module.replace("/", ".")), name)()
+    result = rclpy_type(message.type)()
     for field, value in message.fields.items():
         if isinstance(value, Message):
             value = to_rclpy(value)

@@ -107,7 +107,11 @@ def recover(path: Path) -> list[Recovered]:
         raise InputError(str(path), found, "a bag with MCAP storage")
     completed = [complete_file(file) for file in begun]
     provenance = {name: value for one in completed for name, value in one.provenance.items()}
-    write_metadata(path, [one.summary for one in completed], provenance)
+    try:
+        write_metadata(path, [one.summary for one in completed], provenance)
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise InputError(str(path / "metadata.yaml"), found, "a file that can be written") from None
     return [one.result for one in completed]
 
 

@@ -10,7 +10,13 @@ LOCALIZATIONS = "localizations"
 POSE_6DOF = "pose_6dof"
 POSE = "pose"
 POSE_WITH_COVARIANCE = "pose_with_covariance"
+RELATIVE_POSE = "relative_pose"  # of a further body, in the body frame of the first
 PSI_TARGET = "psi_target"
 ACTUATION_COMMAND = "actuation_command"
 ACTUATION_ACKNOWLEDGEMENT = "actuation_acknowledgement"
 CONTROLLER_STATE = "controller_state"
+
+
+def of_body(body: str, topic: str) -> str:
+    """A topic of one of several bodies, other than the first."""
+    return f"{body}/{topic}"

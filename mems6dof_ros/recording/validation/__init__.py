@@ -1,0 +1,1 @@
+"""What a record survives, as figures of `mems6dof validate lab`."""

@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mems6dof_ros.localization import kernels
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import KAPPA
 from mems6dof_ros.localization.localizations import GaussianFits
@@ -31,7 +32,6 @@ Array = NDArray[np.float64]
 MOMENTS = ("h40", "h31", "h22", "h13", "h04")
 
 _WIDTH = 1.4
-_REACH = 25.0  # a^2 + b^2 in units of w^2, beyond which nothing counts
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,12 @@ def residual_moments(
     light-weighting; other weightings differ by a few per cent. NaN where a fit has failed.
     """
     offset, gain, read_variance = camera.maps
-    values = _moments(np.ascontiguousarray(image), fits.parameters, offset, gain, window_px, _WIDTH)
+    values = np.empty((len(fits), 5))
+    sums = np.empty((len(fits), 5, 5))
+    kernels.residual_sums(
+        kernels.pixels(image), np.ascontiguousarray(fits.parameters), offset, gain, window_px, _WIDTH, sums
+    )
+    _moments(sums, fits.parameters, fits.flux, values)
     beta = (fits.parameters[:, 6] + np.mean(read_variance)) / fits.parameters[:, 2]
     with np.errstate(invalid="ignore"):
         scale = 1 / fits.flux
@@ -62,71 +67,43 @@ def residual_moments(
     return Moments(values, covariance)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})
-def _moments(
-    image: NDArray, parameters: Array, offset: Array, gain: Array, window: int, width: float
-) -> Array:
-    height, columns = image.shape
-    half = window // 2
-    values = np.full((len(parameters), 5), np.nan)
-    maps = offset.size > 1 or gain.size > 1
-    for i in range(len(parameters)):
-        x, y, amplitude, sx, sy, rho, background = parameters[i]
-        if np.isnan(x):
-            continue
+@njit(cache=True, nogil=True, error_model="numpy")
+def _moments(sums: Array, parameters: Array, flux: Array, values: Array) -> None:
+    """``values`` (n, 5): moments from ``sums`` (n, 5, 5) of r H u^i v^j; NaN where those are."""
+    for n in range(len(sums)):
+        _, _, _, sx, sy, rho, _ = parameters[n]
         # Symmetric square root of S^-1: (S + sqrt(det S) 1)^-1 sqrt(tr S + 2 sqrt(det S)).
         root = sx * sy * math.sqrt(1 - rho * rho)
         trace = math.sqrt(sx * sx + sy * sy + 2 * root)
         p, q, r = sx * sx + root, rho * sx * sy, sy * sy + root
-        det = (p * r - q * q) / trace
-        m_aa, m_ab, m_bb = r / det / width, -q / det / width, p / det / width
-        # a^2 + b^2 = k_uu u^2 + 2 k_uv u v + k_vv v^2.
-        k_uu, k_uv, k_vv = m_aa * m_aa + m_ab * m_ab, m_ab * (m_aa + m_bb), m_ab * m_ab + m_bb * m_bb
-        # From column to column the exponentials change by a ratio that itself changes by a constant.
-        curve, sharp_curve = math.exp(-k_uu), math.exp(-k_uu * width * width)
-        s40 = s31 = s22 = s13 = s04 = 0.0
-        o, inverse_gain = offset[0, 0], 1 / gain[0, 0]
-        middle_x, middle_y = round(x), round(y)
-        for row in range(max(middle_y - half, 0), min(middle_y + half + 1, height)):
-            v = row - y
-            # Columns with a^2 + b^2 <= _REACH.
-            spread = (k_uv * v) ** 2 - k_uu * (k_vv * v * v - _REACH)
-            if spread < 0:
-                continue
-            spread = math.sqrt(spread) / k_uu
-            middle = x - k_uv * v / k_uu
-            first = max(math.ceil(middle - spread), middle_x - half, 0)
-            last = min(math.floor(middle + spread), middle_x + half, columns - 1)
-            u = first - x
-            exponent = 0.5 * (k_uu * u * u + 2 * k_uv * u * v + k_vv * v * v)
-            step = k_uu * (u + 0.5) + k_uv * v
-            envelope, ratio = math.exp(-exponent), math.exp(-step)
-            sharp, sharp_ratio = math.exp(-exponent * width * width), math.exp(-step * width * width)
-            for column in range(first, last + 1):
-                u = column - x
-                a, b = m_aa * u + m_ab * v, m_ab * u + m_bb * v
-                aa, bb = a * a, b * b
-                if maps:
-                    o = offset[row, column] if offset.size > 1 else offset[0, 0]
-                    inverse_gain = 1 / (gain[row, column] if gain.size > 1 else gain[0, 0])
-                electrons = (np.int64(image[row, column]) - o) * inverse_gain
-                term = (electrons - background - amplitude * sharp) * envelope
-                s40 += term * (aa * aa - 6 * aa + 3)
-                s31 += term * (aa - 3) * a * b
-                s22 += term * (aa - 1) * (bb - 1)
-                s13 += term * a * (bb - 3) * b
-                s04 += term * (bb * bb - 6 * bb + 3)
-                envelope *= ratio
-                ratio *= curve
-                sharp *= sharp_ratio
-                sharp_ratio *= sharp_curve
-        flux = 2 * math.pi * amplitude * root
-        values[i, 0] = s40 / (math.sqrt(24) * flux)
-        values[i, 1] = s31 / (math.sqrt(6) * flux)
-        values[i, 2] = s22 / (2 * flux)
-        values[i, 3] = s13 / (math.sqrt(6) * flux)
-        values[i, 4] = s04 / (math.sqrt(24) * flux)
-    return values
+        det = (p * r - q * q) / trace * _WIDTH
+        aa, ab, bb = r / det, -q / det, p / det  # a = aa u + ab v, b = ab u + bb v, both over w
+        s00 = sums[n, 0, 0]
+        s20 = _mixed(sums[n], 2, 0, aa, ab, bb)
+        s11 = _mixed(sums[n], 1, 1, aa, ab, bb)
+        s02 = _mixed(sums[n], 0, 2, aa, ab, bb)
+        values[n, 0] = (_mixed(sums[n], 4, 0, aa, ab, bb) - 6 * s20 + 3 * s00) / math.sqrt(24)
+        values[n, 1] = (_mixed(sums[n], 3, 1, aa, ab, bb) - 3 * s11) / math.sqrt(6)
+        values[n, 2] = (_mixed(sums[n], 2, 2, aa, ab, bb) - s20 - s02 + s00) / 2
+        values[n, 3] = (_mixed(sums[n], 1, 3, aa, ab, bb) - 3 * s11) / math.sqrt(6)
+        values[n, 4] = (_mixed(sums[n], 0, 4, aa, ab, bb) - 6 * s02 + 3 * s00) / math.sqrt(24)
+        values[n] /= flux[n]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mixed(sums: Array, m: int, n: int, aa: float, ab: float, bb: float) -> float:
+    """The sum of r H a^m b^n, from those with powers of u and v."""
+    factors = np.zeros(5)  # of u^(degree - k) v^k
+    factors[0] = 1.0
+    for degree in range(m + n):
+        of_u, of_v = (aa, ab) if degree < m else (ab, bb)
+        for k in range(degree + 1, 0, -1):
+            factors[k] = factors[k] * of_u + factors[k - 1] * of_v
+        factors[0] *= of_u
+    total = 0.0
+    for k in range(m + n + 1):
+        total += factors[k] * sums[m + n - k, k]
+    return total
 
 
 def _noise_matrices() -> tuple[Array, Array]:

@@ -54,7 +54,7 @@ LARGEST_ATANH = 1.8  # rho = 0.947
 MOST_ITERATIONS, ROUGH_ITERATIONS = 60, 10
 # Expected decrease of chi-square at which to stop, in units of chi-square per pixel: the last step is
 # then about sqrt(TOLERANCE) standard deviations, and it is still taken.
-TOLERANCE, ROUGH = 1e-4, 1e-3
+TOLERANCE, ROUGH = 1e-3, 1e-2
 MOST_WINDOWS, MOST_OFF_CENTRE = 6, 1.0  # times a window is placed; px from particle to its middle
 
 Array: TypeAlias = NDArray[np.float64]
@@ -80,6 +80,33 @@ def pixels(image: Image) -> Image:
 DATA, READ, VALID, WEIGHTS = 0, 1, 2, 3
 PART, CENTRE, DOWN, UP, SUMS, POWERS = 0, 2, 3, 4, 5, 18
 _FIELDS, _COLUMNS = 4, 23
+
+_BINOMIAL = ((1, 0, 0, 0, 0), (1, 1, 0, 0, 0), (1, 2, 1, 0, 0), (1, 3, 3, 1, 0), (1, 4, 6, 4, 1))
+
+
+@njit(**_OPTIONS)
+def _make_field(side: int, read_variance: float) -> Array:
+    field = np.zeros((_FIELDS, side * ((side + LANES - 1) // LANES * LANES)))
+    field[READ] = read_variance
+    return field
+
+
+@njit(**_OPTIONS)
+def _make_columns(side: int) -> Array:
+    columns = np.zeros((_COLUMNS, (side + LANES - 1) // LANES * LANES))
+    for power in range(5):
+        for j in range(columns.shape[1]):
+            columns[POWERS + power, j] = float(j - side // 2) ** power
+    return columns
+
+
+@njit(**_OPTIONS)
+def _to_theta(parameters: Array, column: int, row: int, theta: Array) -> None:
+    """``theta`` relative to a pixel from x, y, A, sigma_x, sigma_y, rho, B of the image."""
+    theta[0], theta[1] = parameters[0] - column, parameters[1] - row
+    theta[2], theta[6] = parameters[2], parameters[6]
+    theta[3], theta[4] = math.log(parameters[3]), math.log(parameters[4])
+    theta[5] = math.atanh(parameters[5])
 
 
 # Passes over the pixels ------------------------------------------------------------------------------
@@ -750,12 +777,7 @@ def fit_windows(
     nowhere, the fit begins again without.
     """
     height, width = image.shape
-    stride = (window + LANES - 1) // LANES * LANES
-    field, columns = np.zeros((_FIELDS, window * stride)), np.zeros((_COLUMNS, stride))
-    field[READ] = read_variance[0, 0]
-    for power in range(5):
-        for j in range(stride):
-            columns[POWERS + power, j] = float(j - window // 2) ** power
+    field, columns = _make_field(window, read_variance[0, 0]), _make_columns(window)
     algebra, theta = np.zeros((7, 7, 7)), np.empty(7)
     for n in range(len(starts)):
         parameters[n] = np.nan
@@ -769,8 +791,7 @@ def fit_windows(
         while True:
             column, row = round(start[0]), round(start[1])
             if known:
-                theta[0], theta[1], theta[2], theta[6] = start[0] - column, start[1] - row, start[2], start[6]
-                theta[3], theta[4], theta[5] = math.log(start[3]), math.log(start[4]), math.atanh(start[5])
+                _to_theta(start, column, row, theta)
             column, row, pixels = _fit(
                 image,
                 column,
@@ -802,3 +823,88 @@ def fit_windows(
         parameters[n, 2], parameters[n, 6] = theta[2], theta[6]
         parameters[n, 3], parameters[n, 4] = math.exp(theta[3]), math.exp(theta[4])
         parameters[n, 5] = math.tanh(theta[5])
+
+
+@njit(fastmath=_FAST, **_OPTIONS)
+def _residual_sums(
+    theta: Array, width: float, side: int, field: Array, columns: Array, envelope: Array
+) -> None:
+    """As ``_evaluate``, sums of (data - model) H v^0...4, H the Gaussian ``width`` times as wide."""
+    stride, half = columns.shape[1], side // 2
+    amplitude, background = theta[2], theta[6]
+    curve = splat(_central_row(theta, side, columns))
+    theta[3] += math.log(width)
+    theta[4] += math.log(width)
+    wide_curve = splat(_central_row(theta, side, envelope))
+    for j in range(0, stride, LANES):
+        s0 = s1 = s2 = s3 = s4 = splat(0.0)
+        for way in (1, -1):
+            shape, ratio = load(columns, CENTRE, j), load(columns, DOWN if way > 0 else UP, j)
+            wide, wide_ratio = load(envelope, CENTRE, j), load(envelope, DOWN if way > 0 else UP, j)
+            for i in range(half + 1):
+                k = (half + way * i) * stride + j
+                r = load(field, DATA, k) - (shape * amplitude + background)
+                # The central row comes twice.
+                r *= load(field, VALID, k) * wide * (0.5 if i == 0 else 1.0)
+                v, vv = float(way * i), float(i * i)
+                s0 += r
+                s1 += r * v
+                s2 += r * vv
+                s3 += r * (v * vv)
+                s4 += r * (vv * vv)
+                shape *= ratio
+                ratio *= curve
+                wide *= wide_ratio
+                wide_ratio *= wide_curve
+        m = SUMS
+        for column in (s0, s1, s2, s3, s4):
+            store(columns, m, j, column)
+            m += 1
+
+
+@njit(**_OPTIONS)
+def residual_sums(
+    image: Image,
+    parameters: Array,
+    offset: Array,
+    gain: Array,
+    window: int,
+    width: float,
+    sums: Array,
+) -> None:
+    """``sums`` (n, 5, 5): of each fit, sum over its window of (data - model) H u^i v^j for i + j <= 4.
+
+    (u, v): from the particle, px; H: the fitted Gaussian, of unit amplitude and ``width`` times as wide. NaN
+    where ``parameters`` (n, 7) are. The other arguments are those of ``fit_windows``.
+    """
+    field, columns, nothing = _make_field(window, 0.0), _make_columns(window), np.zeros((1, 1))
+    envelope, theta = np.empty_like(columns), np.empty(7)
+    half = window // 2
+    for n in range(len(parameters)):
+        sums[n] = np.nan
+        x, y = parameters[n, 0], parameters[n, 1]
+        if math.isnan(x):
+            continue
+        column, row = round(x), round(y)
+        _read_window(image, column, row, offset, gain, nothing, window, field, columns)
+        _cover(window, field, columns)
+        _to_theta(parameters[n], column, row, theta)
+        for power in range(5):
+            for j in range(columns.shape[1]):
+                columns[POWERS + power, j] = (j - half - theta[0]) ** power
+        _residual_sums(theta, width, window, field, columns, envelope)
+        # Rows are counted from the middle of the window: v' = v + dy.
+        dy = -theta[1]
+        for i in range(5):
+            raw = (
+                _sum(columns, 0, i),
+                _sum(columns, 1, i),
+                _sum(columns, 2, i),
+                _sum(columns, 3, i),
+                _sum(columns, 4, i),
+            )
+            for j in range(5 - i):
+                s = 0.0
+                for k in range(j + 1):
+                    s += _BINOMIAL[j][k] * dy ** (j - k) * raw[k]
+                sums[n, i, j] = s

@@ -67,7 +67,7 @@ def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 @intrinsic
 def load(context: Any, array: Any, row: Any, start: Any) -> Any:
-    """``load(array, row, start)``: ``array[row, start : start + LANES]``, unchecked; unsigned integers too."""
+    """``load(array, row, start)``: ``array[row, start : start + LANES]``, unchecked; also of integers."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature, arguments)

@@ -1,4 +1,4 @@
-"""``frame_source``: publishes the frames of a simulator, of images or of a bag.
+"""``frame_source``: publishes the frames of a camera, a simulator, images, a video or a bag.
 
 ::
 
@@ -11,7 +11,8 @@ while the node is active, and nothing is published while it is not; ``~/start`` 
 Deactivated it keeps its place among the frames, cleaned up it closes the source.
 
 Topics (relative): ``frame_info``, ``truth`` where the source knows it, ``camera_info``, and then
-``image_raw``, all with one header. With ``simulator.commanded`` also those of ``nodes.actuation``;
+``image_raw``, all with one header; before them, with ``publish_clock``, ``/clock``. A camera adds the service
+of ``nodes.camera``. With ``simulator.commanded`` also those of ``nodes.actuation``;
 a source that is a Stage (``simulator.substrate``) adds the service of ``nodes.stage``.
 """
 
@@ -25,7 +26,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
@@ -34,14 +38,18 @@ from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.actuation import serve_commanded_simulator
+from mems6dof_ros.nodes.camera import adjust_camera, camera_parameters, serve_camera
 from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter, of_settings
+from mems6dof_ros.nodes.schedule import Schedule
 from mems6dof_ros.nodes.stage import serve_stage
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
+from mems6dof_ros.sources.cameras.camera import CameraSource
+from mems6dof_ros.sources.replay import Replay
 from mems6dof_ros.sources.simulator import CommandedSimulator
-from mems6dof_ros.sources.source import SOURCES, open_source
+from mems6dof_ros.sources.source import SOURCES, FrameSource, open_source
 from mems6dof_ros.sources.stage import Stage
 
 #: What tells that a frame has been dealt with, and its type.
@@ -59,10 +67,36 @@ PARAMETERS = (
     Parameter(
         "rate",
         10.0,
-        "Frames per second with pacing rate; 0: as the source delivers them.",
+        "Frames per second with pacing rate; 0: as the source delivers them. A camera sets its own pace.",
         "Hz",
         (0.0, 10_000.0),
         changeable=True,
+    ),
+    Parameter(
+        "speed",
+        0.0,
+        "No frame is published earlier than its stamp says at so many times the recorded pace, with pacing"
+        " consumer, or with pacing rate in place of a rate; 0: stamps do not matter.",
+        "1",
+        (0.0, 1000.0),
+        changeable=True,
+    ),
+    Parameter(
+        "begin",
+        0.0,
+        "What comes earlier after the first stamp of a recording is left out.",
+        "s",
+        (0.0, 1e9),
+    ),
+    Parameter(
+        "loop",
+        False,
+        "Begin again after the last frame, with stamps, frame counters and cycles that follow the last ones.",
+    ),
+    Parameter(
+        "publish_clock",
+        False,
+        "Publish /clock, the stamp of each frame before the frame, for nodes with use_sim_time.",
     ),
     Parameter(
         "window",
@@ -138,6 +172,10 @@ PARAMETERS = (
     Parameter("images.saturation_adu", 0, "Largest pixel value; 0: unknown.", "ADU", (0, 65535)),
     Parameter("bag.path", "", "Directory of a rosbag2 bag, or an .mcap file."),
     Parameter("bag.topic", "", "Topic of the images; empty: the only one, or the only one named image_raw."),
+    Parameter("video.path", "", "Video file; exact where it is grey and lossless, such as FFV1."),
+    Parameter("video.pixel_size", NAN, "Image pixel size in object space.", "m", optional=True),
+    Parameter("video.saturation_adu", 0, "Largest pixel value; 0: unknown.", "ADU", (0, 65535)),
+    *camera_parameters(),
 )
 
 
@@ -158,14 +196,19 @@ class FrameSourceNode(InstrumentNode):
         self._changed = threading.Condition()
         self._state = State.WAITING
         self._in_flight: dict[int, float] = {}  # stamp in ns: when published, monotonic s
+        self._schedule = Schedule()
+        self._source: FrameSource | None = None
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_service(Trigger, "~/step", self._on_step)
         self.health.gauge("frames in flight", lambda: len(self._in_flight))
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self.add_post_set_parameters_callback(lambda _: self._wake())
 
     def configure(self) -> None:
         self._source = open_source(self.values["source"], **self._options())
-        info = self._source.info
+        self._frames = Replay(self._source, begin=self.values["begin"], loop=self.values["loop"])
+        info = self._frames.info
         self.get_logger().info(
             f"{info.kind}: {info.width} x {info.height} px {info.encoding},"
             f" {'no end' if info.frames is None else f'{info.frames} frames'}"
@@ -181,6 +224,8 @@ class FrameSourceNode(InstrumentNode):
             topics.CAMERA_INFO: self.create_publisher(CameraInfo, topics.CAMERA_INFO, transport.MESSAGES),
             topics.TRUTH: self.create_publisher(GroundTruth, topics.TRUTH, transport.MESSAGES),
         }
+        wanted = self.values["publish_clock"]
+        self._clocks = self.create_publisher(Clock, "/clock", transport.MESSAGES) if wanted else None
 
     def activate(self) -> None:
         if self.values["pacing"] == "consumer":
@@ -189,6 +234,8 @@ class FrameSourceNode(InstrumentNode):
             self.create_subscription(kind, topic, self._on_acknowledged, transport.MESSAGES, raw=True)
         if isinstance(self._source, CommandedSimulator):
             serve_commanded_simulator(self, self._source)
+        if isinstance(self._source, CameraSource):
+            serve_camera(self, self._source)
         if isinstance(self._source, Stage):
             serve_stage(self, self._source)
         self._abandon = False
@@ -213,7 +260,8 @@ class FrameSourceNode(InstrumentNode):
         super().deactivate()
 
     def cleanup(self) -> None:
-        self._source.stop()
+        self._frames.stop()
+        self._source = None
         self.get_logger().info(
             f"{self.health.total('frames')} frames published, {self.health.total('refused')} refused,"
             f" {self.health.total('lost')} lost"
@@ -248,14 +296,13 @@ class FrameSourceNode(InstrumentNode):
     def _play(self) -> None:
         """Publish the source from its first frame, or from where it was left, to its last."""
         if not self._playing:
-            self._source.start()
+            self._frames.start()
             self._playing = True
-        due = time.monotonic()
         while self._wait_until_wanted():
             try:
-                frame = self._held or self._source.read(timeout=1.0)
-            except TimeoutError:
-                self.health.state = "the source delivers no frames"
+                frame = self._held or self._frames.read(timeout=1.0)
+            except TimeoutError as error:
+                self._tell_of_silence(error)
                 continue
             except InputError as error:
                 self.health.refused(str(error))
@@ -263,10 +310,11 @@ class FrameSourceNode(InstrumentNode):
             if frame is None:
                 break
             self._held = frame
-            due = self._wait_for_turn(due)
-            if self._abandon:
-                return
+            if not self._wait_for_turn(frame):
+                continue
             self._held = None
+            if self._clocks:
+                self._clocks.publish(Clock(clock=messages.to_rclpy(messages.time(frame.stamp_ns))))
             self._deliver(frame)
             with self._changed:
                 self._steps = max(self._steps - 1, 0)
@@ -275,6 +323,12 @@ class FrameSourceNode(InstrumentNode):
         self._playing = False
         self._wait_for_consumer(0)
         self._set_state(State.ENDED)
+
+    def _tell_of_silence(self, error: TimeoutError) -> None:
+        """Only a camera that is away is a problem; one that is not triggered is silent too."""
+        if isinstance(self._source, CameraSource) and not self._source.status.connected:
+            self.health.lost(0, f"camera {self._source.status.name} is away")
+        self.health.state = str(error) or "the source delivers no frames"
 
     def _deliver(self, frame: Frame) -> None:
         """What is done with a frame whose turn has come."""
@@ -302,33 +356,52 @@ class FrameSourceNode(InstrumentNode):
 
     # Pacing -------------------------------------------------------------------------------------
 
+    def _wanted(self) -> bool:
+        """A frame is to be published as soon as it is due."""
+        running = self._state is State.RUNNING and self.values["pacing"] != "step"
+        return not self._abandon and (running or self._steps > 0)
+
     def _wait_until_wanted(self) -> bool:
         """Wait while stopped without a step to make; False: the node ends."""
-
-        def wanted() -> bool:
-            running = self._state is State.RUNNING and self.values["pacing"] != "step"
-            return self._abandon or running or self._steps > 0
-
         with self._changed:
-            self._changed.wait_for(wanted)
+            if not self._wanted():
+                self._schedule.restart()
+            self._changed.wait_for(lambda: self._abandon or self._wanted())
         return not self._abandon
 
-    def _wait_for_turn(self, due: float) -> float:
-        """Wait until the next frame may be published; returns when the one after is due, monotonic s."""
+    def _wait_for_turn(self, frame: Frame) -> bool:
+        """Wait until ``frame`` may be published; False: it is not wanted any more."""
         if self.values["pacing"] == "consumer":
             self._wait_for_consumer(self.get_parameter("window").value - 1)
-            return due
-        self._in_flight.clear()
-        rate = self.get_parameter("rate").value
-        if self.values["pacing"] != "rate" or rate == 0:
-            return due
-        now = time.monotonic()
-        if now - due > 1 / rate:
-            due = now  # late by more than a period: begin a new schedule instead of catching up
-            self.health.count("frames late")
+        else:
+            self._in_flight.clear()
         with self._changed:
-            self._changed.wait_for(lambda: self._abandon, max(due - now, 0))
-        return due + 1 / rate
+            while self._wanted():
+                pace = self._pace()
+                left = self._schedule.due(frame.stamp_ns, *pace) - time.monotonic()
+                if left <= 0 or self._steps > 0:
+                    in_time = self._schedule.keep(frame.stamp_ns, time.monotonic(), *pace)
+                    if not in_time and self.values["pacing"] == "rate":
+                        self.health.count("frames late")
+                    return True
+                self._changed.wait(left)
+        return False
+
+    def _pace(self) -> tuple[float, float]:
+        """Rate and speed for the schedule."""
+        if isinstance(self._source, CameraSource):
+            return 0.0, 0.0
+        rate = self.get_parameter("rate").value if self.values["pacing"] == "rate" else 0.0
+        return rate, self.get_parameter("speed").value
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _on_parameters(self, changes: list[RosParameter]) -> SetParametersResult:
+        if isinstance(self._source, CameraSource):
+            return adjust_camera(self._source, self.values["source"], changes)
+        return SetParametersResult(successful=True)
 
     def _wait_for_consumer(self, in_flight: int) -> None:
         """Wait until at most ``in_flight`` frames are neither acknowledged nor given up."""

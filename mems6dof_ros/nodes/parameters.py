@@ -12,7 +12,7 @@ import importlib
 import math
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -47,6 +47,9 @@ NODES = (
     "foxglove_bridge",
 )
 
+#: Label of the state of a managed node in which parameters take effect.
+UNCONFIGURED = "unconfigured"
+
 Value = bool | int | float | str | Sequence[Any]
 Settings = TypeVar("Settings")
 
@@ -80,8 +83,8 @@ class Parameter:
     """One parameter of a node.
 
     ``span``: inclusive range of a number; ``choices``: the permitted texts; ``element``: type of the
-    elements of a list; ``optional``: NaN is permitted and means "not set"; ``changeable``: may be set while
-    the node runs.
+    elements of a list; ``optional``: NaN is permitted and means "not set"; ``changeable``: may be set in any
+    state of the node; the others only while it is unconfigured, ``fixed`` ones never.
     """
 
     name: str
@@ -93,6 +96,7 @@ class Parameter:
     element: type = str
     optional: bool = False
     changeable: bool = False
+    fixed: bool = False
 
     @property
     def type(self) -> int:
@@ -127,17 +131,18 @@ class Parameter:
     def descriptor(self) -> ParameterDescriptor:
         """For rclpy."""
         unit = f" [{self.unit}]" if self.unit else ""
+        when = "" if self.changeable or self.fixed else f"set while {UNCONFIGURED}"
         descriptor = ParameterDescriptor(
             name=self.name,
             type=self.type,
             description=f"{self.doc}{unit}",
-            additional_constraints=self.constraint,
-            read_only=not self.changeable,
+            additional_constraints="; ".join(filter(None, (self.constraint, when))),
+            read_only=self.fixed,
         )
         if self.span and self.type == ParameterType.PARAMETER_INTEGER:
             first, last = map(int, self.span)
             descriptor.integer_range = [IntegerRange(from_value=first, to_value=last, step=1)]
-        elif self.span:
+        elif self.span and not self.optional:  # rclpy takes NaN for out of any range
             low, high = map(float, self.span)
             descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
         return descriptor
@@ -145,7 +150,10 @@ class Parameter:
 
 #: Of every node.
 AUTOSTART = Parameter(
-    "autostart", True, "Configure and activate by itself; otherwise whoever manages lifecycle nodes does."
+    "autostart",
+    True,
+    "Configure and activate by itself; otherwise whoever manages lifecycle nodes does.",
+    fixed=True,
 )
 
 #: Of nodes that can be paused.
@@ -191,8 +199,11 @@ def to_settings(settings: type[Settings], prefix: str, values: Mapping[str, Any]
     return settings(**taken)
 
 
-def declare(node: Node, parameters: Iterable[Parameter]) -> dict[str, Any]:
-    """Declare all on the node and return their values by name.
+def declare(
+    node: Node, parameters: Iterable[Parameter], state: Callable[[], str] = lambda: UNCONFIGURED
+) -> dict[str, Any]:
+    """Declare all on the node and return their values by name, kept current when they are set later; which
+    is refused, but for changeable ones, while the ``state`` of the node is not "unconfigured".
 
     Raises InputError where a value that the user gave is of the wrong type, out of range, not finite, or
     for a parameter that does not exist.
@@ -222,11 +233,21 @@ def declare(node: Node, parameters: Iterable[Parameter]) -> dict[str, Any]:
 
     def refuse(changes: list[RosParameter]) -> SetParametersResult:
         for change in changes:
-            if change.name in known and (reason := known[change.name].check(change.value)):
+            parameter = known.get(change.name)
+            if parameter is None:
+                continue
+            reason = parameter.check(change.value)
+            if not parameter.changeable and (now := state()) != UNCONFIGURED:
+                reason = f"can be set only while the node is {UNCONFIGURED}, and it is {now}"
+            if reason:
                 return SetParametersResult(successful=False, reason=f"{change.name}: {reason}")
         return SetParametersResult(successful=True)
 
+    def note(changes: list[RosParameter]) -> None:
+        values.update({change.name: change.value for change in changes if change.name in known})
+
     node.add_on_set_parameters_callback(refuse)
+    node.add_post_set_parameters_callback(note)
     return values
 
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -27,7 +28,7 @@ from mems6dof_ros.nodes.lifecycle import ManagedNode
 from mems6dof_ros.nodes.parameters import AUTOSTART, Parameter, declare
 from mems6dof_ros.nodes.worker import Worker
 
-#: Environment variable by which the runner tells a node its process id.
+#: Environment variable by which the runner, or `launch`, tells a node its process id.
 PARENT_VARIABLE = "MEMS6DOF_PARENT"
 
 QUEUE_PARAMETERS = (
@@ -74,7 +75,7 @@ class InstrumentNode(ManagedNode):
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         super().__init__(name)
-        self.values = declare(self, (AUTOSTART, *parameters))
+        self.values = declare(self, (AUTOSTART, *parameters), lambda: self.lifecycle)
         self.health = Health(self)
         self.worker: Worker[Any] | None = None
         self.finished = threading.Event()
@@ -247,13 +248,15 @@ def run(create: Callable[[], InstrumentNode], args: list[str] | None = None, *, 
 
 
 def _die_with_parent() -> None:
-    """Be told by SIGTERM when the runner that started this process is gone, even when it was killed."""
-    parent = os.environ.pop(PARENT_VARIABLE, None)
-    if parent and sys.platform == "linux":
+    """Be told by SIGTERM when the runner or `launch` that started this process is gone, even by a kill."""
+    parent = int(os.environ.pop(PARENT_VARIABLE, 0))
+    if not parent or sys.platform != "linux":
+        return
+    if os.getppid() == parent:
         set_parent_death_signal = 1  # prctl.h
         ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)
-        if os.getppid() != int(parent):  # it died before we asked
-            sys.exit(1)
+    if not Path(f"/proc/{parent}").exists():  # it died before we asked
+        sys.exit(1)
 
 
 def _spin(node: InstrumentNode, stop: threading.Event) -> None:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from mems6dof_ros.nodes.common import PARENT_VARIABLE
 from mems6dof_ros.nodes.system import NodeSpec, System, given
 
 
@@ -41,6 +42,7 @@ def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
         parameters=[*files, given(spec)],
         remappings=list(spec.remappings.items()),
         output="screen",
+        additional_env={PARENT_VARIABLE: str(os.getpid())},
         # Of a finite system, the end of its source and the failure of any node are the end.
         on_exit=Shutdown() if finite else None,
     )

@@ -10,6 +10,8 @@ import pytest
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from peers import SMALL_GEAR, NodeProcess, Peer
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -89,12 +91,39 @@ def test_an_error_is_one_line_and_the_node_can_be_tried_again(start: Start, peer
         assert not change(peer, "localizer", CONFIGURE)
         assert state(peer, "localizer") == "unconfigured"
     peer.wait(
-        lambda: State.TRANSITION_STATE_ERRORPROCESSING
-        in [event.goal_state.id for event in peer.received["localizer/transition_event"]]
+        lambda: (
+            State.TRANSITION_STATE_ERRORPROCESSING
+            in [event.goal_state.id for event in peer.received["localizer/transition_event"]]
+        )
     )
     assert node.output.count("unconfigured: absent.yaml: found") == 2
     assert "Traceback" not in node.output
     assert node.stop() == 0
+
+
+def test_parameters_take_effect_when_the_node_is_configured_anew(start: Start, peer: Peer) -> None:
+    node = start_node(start, "pose_estimator")
+    node.wait_for_line("ready")
+
+    def set_body(name: str) -> tuple[bool, str]:
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
+        request = SetParameters.Request(parameters=[Parameter(name="body", value=value)])
+        result = peer.call(SetParameters, "pose_estimator/set_parameters", request).results[0]
+        return result.successful, result.reason
+
+    assert set_body("ring") == (
+        False,
+        "body: can be set only while the node is unconfigured, and it is active",
+    )
+    assert change(peer, "pose_estimator", DEACTIVATE)
+    assert change(peer, "pose_estimator", CLEANUP)
+    assert set_body("ring") == (True, "")
+    assert change(peer, "pose_estimator", CONFIGURE)
+    assert change(peer, "pose_estimator", ACTIVATE)
+    peer.listen(Pose6DOF, "pose_6dof")
+    peer.publisher(Localizations, "localizations").publish(Localizations(frame_counter=1, cycle=1))
+    peer.wait(lambda: peer.received["pose_6dof"])
+    assert peer.received["pose_6dof"][0].body == "ring"
 
 
 def test_an_inactive_source_publishes_nothing_and_goes_on_where_it_was(start: Start, peer: Peer) -> None:

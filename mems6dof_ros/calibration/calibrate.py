@@ -18,8 +18,19 @@ from mems6dof_ros.calibration.checks import (
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.file import Calibration, ValidRange
 from mems6dof_ros.calibration.focus_stack import BeadStack, FocusStack, Rejection
-from mems6dof_ros.calibration.model_fit import GROUPS, BeadCurve, ModelFit, Orders, fit_model, sharpest_stage
+from mems6dof_ros.calibration.model_fit import (
+    GROUPS,
+    BeadCurve,
+    ModelFit,
+    Orders,
+    fit_focus,
+    fit_model,
+    sharpest_stage,
+)
 from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, features, field_position
+from mems6dof_ros.calibration.psf_fit import Retrieval
+from mems6dof_ros.calibration.psf_model import PsfBead, PsfModel, fit_psf
+from mems6dof_ros.calibration.psf_pupil import Imaging
 from mems6dof_ros.calibration.rho_amp import reference_map
 from mems6dof_ros.errors import InputError
 
@@ -29,6 +40,8 @@ OUTLIER = 8.0
 BRIGHTNESS_FACTOR = 30.0
 #: Below this number of beads the scatter between particles is poorly known.
 FEW_BEADS = 10
+#: Departure of images from the pupil model, relative to their light, that deserves a warning.
+PSF_MISFIT = 0.05
 
 #: Orders for a quick look at one stack.
 _PLAIN = Orders(dict.fromkeys(GROUPS, 1), dict.fromkeys(GROUPS, 8), 1)
@@ -40,10 +53,13 @@ class CalibrationSettings:
     reach 2 um further let particles beyond it be recognised. ``orders``: instead of choosing them by
     cross-validation. ``rotations`` rad: the substrate's orientation in each stack.
     ``numerical_aperture`` and ``reference``, an earlier calibration of the same optics: what the stage's step
-    and direction are checked against."""
+    and direction are checked against. With ``wavelength`` of emission and ``bead_diameter``, m, as well, the
+    point-spread function for method psf is calibrated too."""
 
     axial_range: float | None = None
     numerical_aperture: float | None = None
+    wavelength: float | None = None
+    bead_diameter: float | None = None
     reference: Calibration | None = None
     orders: Orders | None = None
     rotations: tuple[float, ...] | None = None
@@ -52,7 +68,7 @@ class CalibrationSettings:
 @dataclass(frozen=True)
 class CalibrationResult:
     """A ``calibration`` and how it came about: the ``fit``, the ``beads`` used with their curves, the
-    ``rejected`` ones, and ``warnings``, one sentence each."""
+    ``rejected`` ones, ``warnings``, one sentence each, and the beads' ``pupils`` where they were wanted."""
 
     calibration: Calibration
     fit: ModelFit
@@ -61,6 +77,7 @@ class CalibrationResult:
     curves: tuple[BeadCurve, ...]
     rejected: tuple[Rejection, ...]
     warnings: tuple[str, ...]
+    pupils: tuple[Retrieval, ...] = ()
 
 
 def calibrate(
@@ -99,6 +116,7 @@ def calibrate(
             )
         beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
     chosen = [bead for _, bead in beads]
+    psf, pupils = _fit_psf(chosen, curves, fit, settings, first.pixel_size, progress)
     calibration = Calibration(
         fit.model,
         first.pixel_size,
@@ -108,10 +126,63 @@ def calibrate(
         first.camera,
         _valid_range(chosen, curves, interval, first, settings.axial_range),
         provenance=_provenance(stacks, settings, fit, len(beads), len(rejected)),
+        psf=psf,
     )
     warnings = _warnings(curves, rejected, fit, settings, first.pixel_size)
+    if psf is not None and psf.misfit > PSF_MISFIT:
+        warnings.append(
+            f"method psf: the images depart from the pupil model by {psf.misfit:.1%} of the light; are"
+            " aperture, wavelength and diameter right?"
+        )
     return CalibrationResult(
-        calibration, fit, tuple(stacks), tuple(chosen), tuple(curves), tuple(rejected), tuple(warnings)
+        calibration,
+        fit,
+        tuple(stacks),
+        tuple(chosen),
+        tuple(curves),
+        tuple(rejected),
+        tuple(warnings),
+        tuple(pupils),
+    )
+
+
+def _fit_psf(
+    beads: Sequence[BeadStack],
+    curves: Sequence[BeadCurve],
+    fit: ModelFit,
+    settings: CalibrationSettings,
+    pixel_size: float,
+    progress: Callable[[str], None],
+) -> tuple[PsfModel | None, list[Retrieval]]:
+    """The point-spread function and every bead's pupil, where it is known what to expect of the images."""
+    aperture, wavelength, diameter = (
+        settings.numerical_aperture,
+        settings.wavelength,
+        settings.bead_diameter,
+    )
+    if aperture is None or wavelength is None or diameter is None:
+        return None, []
+    found = []
+    for bead, curve, sharpest in zip(beads, curves, fit.sharpest, strict=True):
+        if bead.windows is None:
+            raise InputError("method psf", "beads without their pixels", "stacks measured by measure_stack")
+        x, y = bead.fits.parameters[bead.in_focus, :2]
+        found.append(PsfBead(bead.windows, curve.x, curve.y, float(sharpest), (float(x), float(y))))
+    model = fit.model
+    x, y = (np.array([getattr(curve, axis) for curve in curves]) for axis in "xy")
+
+    def focus(stages: Array) -> tuple[FieldMap, float]:
+        surface = fit_focus(curves, stages, model.curves.radius, settings.rotations, fit.orders.focus)
+        return surface.surface, surface.variance
+
+    return fit_psf(
+        found,
+        Imaging(aperture, wavelength, diameter, pixel_size),
+        model.curves.radius,
+        model.curves.interval,
+        fit.sharpest + model.focus(x, y),
+        focus,
+        lambda done, total: progress(f"pupil of bead {done} of {total}"),
     )
 
 
@@ -233,6 +304,8 @@ def _provenance(
         "settings": {
             "axial_range_m": settings.axial_range,
             "numerical_aperture": settings.numerical_aperture,
+            "wavelength_m": settings.wavelength,
+            "bead_diameter_m": settings.bead_diameter,
             "reference": settings.reference.calibration_id if settings.reference else None,
             "orders": "cross-validation" if settings.orders is None else asdict(settings.orders),
             "rotations_rad": None if settings.rotations is None else list(settings.rotations),

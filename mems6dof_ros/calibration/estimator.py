@@ -1,4 +1,4 @@
-"""From fitted shapes to positions: the two methods differ only in the features they read.
+"""From fitted shapes to positions: these methods differ only in the features they read.
 
 ``rho_amp``, the paper's route, reads its one feature; ``joint`` reads both widths, the correlation and the
 moments of the residual image; without an image at hand, the shape of the fits alone.
@@ -12,6 +12,7 @@ real particles about the model is common to x, y and z: every position has its f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -25,9 +26,11 @@ from mems6dof_ros.calibration.moments import MOMENTS, Moments
 from mems6dof_ros.calibration.optical_model import FEATURES, OpticalModel, features, field_position
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
-#: Features that each method reads.
+#: Ways to read z. ``psf`` reads the pixels themselves, see psf_estimator.
+METHODS = ("rho_amp", "joint", "psf")
+#: Features that each set of them consists of.
 SHAPE = ("ln_sigma_x", "ln_sigma_y", "atanh_rho")
-METHODS = {"rho_amp": ("rho_amp",), "joint": (*SHAPE, *MOMENTS)}
+ALL_FEATURES = (*SHAPE, *MOMENTS)
 
 #: A second z is a candidate while its L is worse by less than this: 4 sigma of a likelihood ratio.
 AMBIGUITY_GAP = 16.0
@@ -40,6 +43,19 @@ BLIND_FRACTION = 0.25
 _USELESS = 0.25e-6
 
 _GRID_STEP = 125e-9
+
+
+class _Search(NamedTuple):
+    """Features of n particles, their curves, and where on them they lie: best and second best."""
+
+    measured: Array
+    noise: Array
+    local: Array
+    limits: NDArray[np.int64]
+    defocus: Array
+    objective: Array
+    chi_square: Array
+    focus: Array
 
 
 class Estimator:
@@ -82,21 +98,22 @@ class Estimator:
         flags = np.where(np.isfinite(fits.parameters).all(axis=1), 0, Flag.NO_Z).astype(np.uint32)
         usable = np.flatnonzero(flags == 0)
         if len(usable):
-            chosen = GaussianFits(
-                fits.parameters[usable],
-                fits.covariance[usable],
-                fits.chi_square[usable],
-                fits.iterations[usable],
-                fits.flags[usable],
-            )
             position[usable], covariance[usable], z_gap[usable], flags[usable] = self._locate(
-                chosen, None if moments is None else moments[usable]
+                fits[usable], None if moments is None else moments[usable]
             )
         return Positions(position, covariance, z_gap, flags)
 
-    def _locate(
-        self, fits: GaussianFits, moments: Moments | None
-    ) -> tuple[Array, Array, Array, NDArray[np.uint32]]:
+    def candidates(self, fits: GaussianFits, moments: Moments | None = None) -> tuple[Array, Array]:
+        """The best and second-best z (n, 2) m and the chi-square (n,) between them; NaN where none is."""
+        z, gap = np.full((len(fits), 2), np.nan), np.full(len(fits), np.nan)
+        usable = np.flatnonzero(np.isfinite(fits.parameters).all(axis=1))
+        if len(usable):
+            search = self._search(fits[usable], None if moments is None else moments[usable])
+            z[usable] = search.defocus + search.focus[:, None]
+            gap[usable] = search.objective[:, 1] - search.objective[:, 0]
+        return z, gap
+
+    def _search(self, fits: GaussianFits, moments: Moments | None) -> _Search:
         model, used = self._model, self._used
         x, y = field_position(fits.parameters, self._pixel_size, self._image_size)
         measured, noise = features(fits, moments, self._pixel_size, model.reference(x, y))
@@ -113,8 +130,13 @@ class Estimator:
             self._slope_basis,
             self._scatter,
         )
+        return _Search(measured, noise, local, limits, defocus, objective, chi_square, model.focus(x, y))
+
+    def _locate(
+        self, fits: GaussianFits, moments: Moments | None
+    ) -> tuple[Array, Array, Array, NDArray[np.uint32]]:
+        measured, noise, local, limits, defocus, objective, chi_square, focus = self._search(fits, moments)
         best, second = defocus.T
-        focus = model.focus(x, y)
         position, covariance = self._corrected(measured, noise, local, best, focus)
         z_gap = objective[:, 1] - objective[:, 0]
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from mems6dof_ros.calibration.zernike import zernike, zernike_count, zernike_order
 
@@ -81,7 +82,7 @@ class FieldRegression:
     """Weighted least squares of :class:`FieldCurves` for several orders and subsets of beads.
 
     The normal equations of every bead are formed once, at the highest degree; lower orders are
-    leading sub-blocks, since both bases are nested.
+    leading sub-blocks, since both bases are nested. Fits of one subset in a row share their sums.
     """
 
     def __init__(
@@ -104,18 +105,33 @@ class FieldRegression:
             moment.append(np.einsum("im,ik->km", t, bead.weights * bead.values))
         self._gram = np.array(gram)
         self._moment = np.array(moment)
+        self._key: bytes | None = None
+        self._last: tuple[Array, Array]
 
     def fit(self, field_order: int, degree: int, use: NDArray[np.bool_] | None = None) -> FieldCurves:
         """Coefficients of radial order ``field_order`` and ``degree`` from the beads in ``use`` (all)."""
-        beads = slice(None) if use is None else use
+        gram, moment = self._sums(use)
         j, m = zernike_count(field_order), degree + 1
-        z = self._terms[beads, :j]
-        gram = np.einsum("bi,bj,bkml->kimjl", z, z, self._gram[beads, :, :m, :m], optimize=True)
-        moment = np.einsum("bi,bkm->kim", z, self._moment[beads, :, :m], optimize=True)
-        outputs = gram.shape[0]
-        gram = gram.reshape(outputs, j * m, j * m)
+        gram = gram[:, :j, :m, :j, :m].reshape(len(gram), j * m, j * m)
         # A ridge of 1e-9 of the mean diagonal: below any noise, and it keeps sparse fields solvable.
         ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2) / (j * m)
-        gram += ridge[:, None, None] * np.eye(j * m)
-        solution = np.linalg.solve(gram, moment.reshape(outputs, j * m, 1))
-        return FieldCurves(self.radius, self.interval, solution.reshape(outputs, j, m))
+        solution = [
+            cho_solve(cho_factor(one + r * np.eye(j * m), overwrite_a=True), right.ravel())
+            for one, r, right in zip(gram, ridge, moment[:, :j, :m], strict=True)
+        ]
+        return FieldCurves(self.radius, self.interval, np.array(solution).reshape(len(gram), j, m))
+
+    def _sums(self, use: NDArray[np.bool_] | None) -> tuple[Array, Array]:
+        """Normal equations of the beads in ``use`` at the highest orders; the last ones are remembered."""
+        key = b"" if use is None else use.tobytes()
+        if key != self._key:
+            beads = slice(None) if use is None else use
+            z = self._terms[beads]
+            self._key, self._last = (
+                key,
+                (
+                    np.einsum("bi,bj,bkml->kimjl", z, z, self._gram[beads], optimize=True),
+                    np.einsum("bi,bkm->kim", z, self._moment[beads], optimize=True),
+                ),
+            )
+        return self._last

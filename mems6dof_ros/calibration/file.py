@@ -21,13 +21,16 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from mems6dof_ros.calibration.estimator import METHODS, SHAPE, Estimator
+from mems6dof_ros.calibration import psf_model
+from mems6dof_ros.calibration.estimator import ALL_FEATURES, METHODS, SHAPE, Estimator
 from mems6dof_ros.calibration.field_correction import FieldCorrection
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
 from mems6dof_ros.calibration.field_modes import FieldModes
 from mems6dof_ros.calibration.interface import Positions
 from mems6dof_ros.calibration.moments import residual_moments
 from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
+from mems6dof_ros.calibration.psf_estimator import PsfEstimator
+from mems6dof_ros.calibration.psf_model import PsfModel
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import WEIGHTINGS
@@ -67,11 +70,18 @@ class Calibration:
     valid: ValidRange
     method: str = DEFAULT_METHOD
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    psf: PsfModel | None = None
     correction: FieldCorrection | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError("calibration method", repr(self.method), f"one of {', '.join(METHODS)}")
+        if self.method == "psf" and self.psf is None:
+            raise InputError(
+                "calibration method",
+                "'psf', which this calibration does not contain",
+                "'joint' or 'rho_amp', or a calibration made with aperture, wavelength and diameter",
+            )
         if self.correction is not None and self.correction.method != self.method:
             made = f"{self.correction.method!r}, with which the field correction was measured"
             raise InputError("calibration method", repr(self.method), made)
@@ -86,26 +96,51 @@ class Calibration:
         return Estimator(self.model, names, self.valid.z, self.pixel_size, self.image_size)
 
     @cached_property
-    def _by_method(self) -> Estimator:
-        return self._estimator(METHODS[self.method])
+    def _by_amplitude(self) -> Estimator:
+        return self._estimator(("rho_amp",))
 
     @cached_property
     def _by_shape(self) -> Estimator:
         return self._estimator(SHAPE)
 
+    @cached_property
+    def _by_all_features(self) -> Estimator:
+        return self._estimator(ALL_FEATURES)
+
+    @cached_property
+    def _by_pixels(self) -> PsfEstimator:
+        assert self.psf is not None
+        field = self.valid.x, self.valid.y
+        return PsfEstimator(
+            self.psf,
+            self._by_all_features,
+            self.camera,
+            self.window_px,
+            self.valid.z,
+            self.pixel_size,
+            self.image_size,
+            field,
+        )
+
     def locate(self, fits: GaussianFits, image: NDArray[np.generic] | None = None) -> Positions:
         """Positions of ``fits``; failed fits give NaN, values beyond the valid range are flagged.
 
         ``image`` (height, width) ADU, in which they were fitted: method joint reads from it what the
-        Gaussians leave over, and is less precise without.
+        Gaussians leave over, and is less precise without; method psf raises InputError without.
         """
         if self.method == "rho_amp":
-            found = _guarded(self._by_method.locate(fits), self._by_shape.locate(fits))
+            found = _guarded(self._by_amplitude.locate(fits), self._by_shape.locate(fits))
         elif image is None:
+            if self.method == "psf":
+                raise InputError("calibration method", "'psf' without an image", "the image of the fits")
             found = self._by_shape.locate(fits)
         else:
             moments = residual_moments(image, fits, self.camera, self.window_px)
-            found = self._by_method.locate(fits, moments)
+            found = (
+                self._by_pixels.locate(fits, moments, image)
+                if self.method == "psf"
+                else self._by_all_features.locate(fits, moments)
+            )
         x, y = field_position(fits.parameters, self.pixel_size, self.image_size)
         with np.errstate(invalid="ignore"):
             outside = _outside(x, self.valid.x) | _outside(y, self.valid.y)
@@ -238,6 +273,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
 
 def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
     model, camera, valid = calibration.model, calibration.camera, calibration.valid
+    psf = {} if calibration.psf is None else {"psf": psf_model.content(calibration.psf)}
     return {
         "optics": {
             "pixel_size_m": float(calibration.pixel_size),
@@ -267,6 +303,7 @@ def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
             "scatter_defocus_m": model.nodes.tolist(),
             "scatter_covariance": model.scatter.tolist(),
         },
+        **psf,
     }
 
 
@@ -281,6 +318,9 @@ class _Fields:
         if not isinstance(values, dict):
             raise InputError(where, type(values).__name__, "named values")
         self._values, self._where = values, where
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
 
     def __call__(self, name: str) -> Any:
         if name not in self._values:
@@ -354,6 +394,7 @@ def _read_version_1(fields: _Fields) -> Calibration:
         ),
         method=fields("method"),
         provenance=fields("provenance"),
+        psf=psf_model.read(fields.section("psf")) if "psf" in fields else None,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.moments import Moments, residual_moments
+from mems6dof_ros.calibration.psf_fit import BeadWindows
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
@@ -39,11 +40,13 @@ _SEED_PLANES = 7
 
 @dataclass(frozen=True)
 class BeadStack:
-    """One bead through focus: ``stage_z`` (n,) m in the order of the planes, its ``fits`` and ``moments``."""
+    """One bead through focus: ``stage_z`` (n,) m in the order of the planes, its ``fits`` and ``moments``,
+    and the ``windows`` of its pixels where they were kept."""
 
     stage_z: Array
     fits: GaussianFits
     moments: Moments
+    windows: BeadWindows | None = None
 
     @property
     def in_focus(self) -> int:
@@ -107,7 +110,7 @@ def measure_stack(
     seeds = _find_beads(planes)
     fits = _track(planes, seeds, camera, weighting, window_px, progress)
     moments = [residual_moments(p.image, f, camera, window_px) for p, f in zip(planes, fits, strict=True)]
-    beads, rejected = _select(fits, moments, seeds, stage_z, window_px)
+    beads, rejected = _select(planes, camera, fits, moments, seeds, stage_z, window_px)
     shown, gallery = _gallery(planes, beads, window_px)
     return FocusStack(
         beads,
@@ -220,6 +223,8 @@ def _track(
 
 
 def _select(
+    planes: Sequence[Frame],
+    camera: CameraNoise,
     fits: Sequence[GaussianFits],
     moments: Sequence[Moments],
     seeds: Array,
@@ -246,7 +251,10 @@ def _select(
         elif (flags[used, number] & Flag.SATURATED).any():
             reason = f"saturated in {np.count_nonzero(flags[used, number] & Flag.SATURATED)} planes"
         else:
-            bead = _bead(fits, moments, used, number, stage_z)
+            bead = _bead(
+                [fits[k][[number]] for k in used], [moments[k][[number]] for k in used], stage_z[used]
+            )
+            bead = replace(bead, windows=_windows([planes[k] for k in used], camera, bead, window_px))
             if 1 < bead.in_focus < len(used) - 2:
                 beads.append(bead)
                 places.append(seed)
@@ -287,25 +295,21 @@ def _run_through_focus(parameters: Array, good: NDArray[np.bool_]) -> NDArray[np
     return np.arange(first, last)
 
 
-def _bead(
-    fits: Sequence[GaussianFits],
-    moments: Sequence[Moments],
-    used: NDArray[np.intp],
-    number: int,
-    stage_z: Array,
-) -> BeadStack:
-    chosen = [fits[index] for index in used]
+def _bead(fits: Sequence[GaussianFits], moments: Sequence[Moments], stage_z: Array) -> BeadStack:
+    """One bead from its fits and moments, one of each per plane."""
     return BeadStack(
-        stage_z[used],
+        stage_z,
         GaussianFits(
-            np.array([f.parameters[number] for f in chosen]),
-            np.array([f.covariance[number] for f in chosen]),
-            np.array([f.chi_square[number] for f in chosen]),
-            np.array([f.iterations[number] for f in chosen]),
-            np.array([f.flags[number] for f in chosen]),
+            *(np.concatenate([getattr(f, field.name) for f in fits]) for field in fields(GaussianFits))
         ),
-        Moments(
-            np.array([moments[index].values[number] for index in used]),
-            np.array([moments[index].covariance[number] for index in used]),
-        ),
+        Moments(np.concatenate([m.values for m in moments]), np.concatenate([m.covariance for m in moments])),
     )
+
+
+def _windows(planes: Sequence[Frame], camera: CameraNoise, bead: BeadStack, window_px: int) -> BeadWindows:
+    """The same window of every plane, in electrons, about the bead in focus."""
+    column, row = np.rint(bead.fits.parameters[bead.in_focus, :2]).astype(int) - window_px // 2
+    cut = np.s_[row : row + window_px, column : column + window_px]
+    offset, gain, read_variance = (values[cut] if values.size > 1 else values for values in camera.maps)
+    electrons = np.array([(plane.image[cut] - offset) / gain for plane in planes], dtype=np.float32)
+    return BeadWindows((int(column), int(row)), bead.stage_z, electrons, float(np.mean(read_variance)))

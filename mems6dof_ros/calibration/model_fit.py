@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,7 @@ _MODES = np.eye(len(FEATURES))
 _MODES[2:4, 2:4] = np.array([[1, 1], [1, -1]]) / np.sqrt(2)
 #: Of orders whose scores agree within this factor the fewest coefficients are taken.
 _AS_GOOD = 1.01
+_AS_GOOD_FOCUS = 1.03
 #: Scatter assumed before it is known, as standard deviations of FEATURES: of the order of real beads'.
 _FIRST_SCATTER = np.diag(np.array([5e-9, 5e-9, *[0.02] * 4, *[5e-4] * 5]) ** 2)
 
@@ -73,6 +75,17 @@ class CrossValidation:
 
     curves: dict[str, dict[tuple[int, int], float]]
     focus: dict[int, float]
+
+
+class FocusFit(NamedTuple):
+    """``scores``: rms left-one-out residual m by order; the ``order`` taken; the focus ``surface``, its
+    ``variance`` m^2, and the beads' ``own_height`` (b,) m about it."""
+
+    scores: dict[int, float]
+    order: int
+    surface: FieldMap
+    own_height: Array
+    variance: float
 
 
 @dataclass(frozen=True)
@@ -131,18 +144,15 @@ def fit_model(
             if number > 0 and len(beads) > 1:
                 alignment.drop_outliers(residual)
             alignment.align(curves)
-    focus_scores, focus_order = _choose_focus_order(beads, alignment.sharpest, reference.radius, rotations)
-    if orders is not None:
-        focus_order = orders.focus
-    focus, own_height, focus_variance = _focus_surface(
-        beads, alignment.sharpest, reference.radius, focus_order, rotations
+    focus = fit_focus(
+        beads, alignment.sharpest, reference.radius, rotations, None if orders is None else orders.focus
     )
     return ModelFit(
-        OpticalModel(curves, focus, reference, nodes, scatter, focus_variance),
-        Orders(current.field, current.degree, focus_order),
-        CrossValidation(validation.curves, focus_scores),
+        OpticalModel(curves, focus.surface, reference, nodes, scatter, focus.variance),
+        Orders(current.field, current.degree, focus.order),
+        CrossValidation(validation.curves, focus.scores),
         alignment.sharpest,
-        own_height,
+        focus.own_height,
         [sample.argument for sample in alignment.samples()],
         residual,
     )
@@ -323,22 +333,27 @@ def _residual(sample: BeadSamples, curves: FieldCurves) -> Array:
 def _cross_validate(
     regression: FieldRegression, pieces: list[BeadSamples], highest: tuple[int, int]
 ) -> CrossValidation:
-    scores: dict[str, dict[tuple[int, int], float]] = {name: {} for name in GROUPS}
-    field_orders = [order for order in FIELD_ORDERS if order <= highest[0]]
-    degrees = [degree for degree in DEGREES if degree <= highest[1]]
-    folds = _folds(len(pieces))
-    for field_order in field_orders:
-        for degree in degrees:
-            total, count = np.zeros(len(FEATURES)), 0
-            for left_out in folds:
-                curves = regression.fit(field_order, degree, ~left_out)
-                for index in np.flatnonzero(left_out):
-                    sample = pieces[index]
-                    total += np.sum(_residual(sample, curves) ** 2 * sample.weights, axis=0)
-                    count += len(sample.argument)
-            for name, group in GROUPS.items():
-                scores[name][field_order, degree] = float(np.mean(total[group]) / count)
-    return CrossValidation(scores, {})
+    orders = [
+        (order, degree)
+        for order in FIELD_ORDERS
+        for degree in DEGREES
+        if order <= highest[0] and degree <= highest[1]
+    ]
+    total = {key: np.zeros(len(FEATURES)) for key in orders}
+    for left_out in _folds(len(pieces)):
+        for key in orders:
+            curves = regression.fit(*key, ~left_out)
+            for index in np.flatnonzero(left_out):
+                sample = pieces[index]
+                total[key] += np.sum(_residual(sample, curves) ** 2 * sample.weights, axis=0)
+    count = sum(len(sample.argument) for sample in pieces)
+    return CrossValidation(
+        {
+            name: {key: float(np.mean(total[key][group]) / count) for key in orders}
+            for name, group in GROUPS.items()
+        },
+        {},
+    )
 
 
 def _best(validation: CrossValidation) -> Orders:
@@ -399,10 +414,28 @@ def _focus_design(
     return np.column_stack([*columns, -surface]), len(columns)
 
 
-def _choose_focus_order(
+def fit_focus(
+    beads: Sequence[BeadCurve],
+    sharpest: Array,
+    radius: float,
+    rotations: Sequence[float] | None,
+    order: int | None = None,
+) -> FocusFit:
+    """Focus surface through the stage positions ``sharpest`` (b,) m of ``beads``.
+
+    ``order``: of the surface, else the lowest that predicts beads left out as well as any.
+    """
+    scores = _focus_scores(beads, sharpest, radius, rotations)
+    if order is None:
+        best = min(scores.values(), default=0.0)
+        order = next((order for order, score in scores.items() if score <= _AS_GOOD_FOCUS * best), 0)
+    return FocusFit(scores, order, *_focus_surface(beads, sharpest, radius, order, rotations))
+
+
+def _focus_scores(
     beads: Sequence[BeadCurve], sharpest: Array, radius: float, rotations: Sequence[float] | None
-) -> tuple[dict[int, float], int]:
-    """Rms left-one-out residual (m) of each focus order that the beads can carry, and the best order."""
+) -> dict[int, float]:
+    """Rms left-one-out residual (m) of each focus order that the beads can carry."""
     scores = {}
     for order in FOCUS_ORDERS:
         design, _ = _focus_design(beads, radius, order, rotations)
@@ -411,7 +444,7 @@ def _choose_focus_order(
         hat = design @ np.linalg.pinv(design)
         left_out = (sharpest - hat @ sharpest) / (1 - np.diag(hat))
         scores[order] = float(np.sqrt(np.mean(left_out**2)))
-    return scores, min(scores, key=lambda order: scores[order]) if scores else 0
+    return scores
 
 
 def _focus_surface(

@@ -95,15 +95,4 @@ def plain_orders(field: int, degree: int) -> Orders:
 
 
 def _planes(bead: BeadStack, chosen: NDArray[np.intp]) -> BeadStack:
-    fits = bead.fits
-    return BeadStack(
-        bead.stage_z[chosen],
-        type(fits)(
-            fits.parameters[chosen],
-            fits.covariance[chosen],
-            fits.chi_square[chosen],
-            fits.iterations[chosen],
-            fits.flags[chosen],
-        ),
-        bead.moments[chosen],
-    )
+    return BeadStack(bead.stage_z[chosen], bead.fits[chosen], bead.moments[chosen])

@@ -36,6 +36,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     fit.add_argument("--axial-range", type=float, help="largest |defocus| to declare valid, m")
     fit.add_argument("--aperture", type=float, help="numerical aperture, to check the stage's step")
+    fit.add_argument(
+        "--wavelength", type=float, help="of the emission, m: with aperture and diameter, calibrates psf"
+    )
+    fit.add_argument("--diameter", type=float, help="of the beads, m")
     fit.add_argument("--reference", help="earlier calibration of these optics, to check step and direction")
     fit.add_argument("--method", help="method that the file proposes (default: the best by measurement)")
     parser.set_defaults(run=run)
@@ -62,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     settings = CalibrationSettings(
         axial_range=args.axial_range,
         numerical_aperture=args.aperture,
+        wavelength=args.wavelength,
+        bead_diameter=args.diameter,
         reference=load_calibration(args.reference) if args.reference else None,
         rotations=rotations,
     )

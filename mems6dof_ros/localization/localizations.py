@@ -48,6 +48,16 @@ class GaussianFits:
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def __getitem__(self, index: NDArray[np.generic]) -> GaussianFits:
+        """The fits that ``index`` (numbers or mask) chooses."""
+        return GaussianFits(
+            self.parameters[index],
+            self.covariance[index],
+            self.chi_square[index],
+            self.iterations[index],
+            self.flags[index],
+        )
+
     @cached_property
     def flux(self) -> NDArray[np.float64]:
         """Electrons in each Gaussian, 2 pi A sigma_x sigma_y sqrt(1 - rho^2), (n,)."""

@@ -1,0 +1,244 @@
+"""The calibrated point-spread function: a pupil whose phase varies smoothly over the field, and its scatter.
+
+It is fitted to the pixels of the calibration beads (see psf_fit) and owes nothing to the Gaussian fits but
+starting values. Heights count as in the forward model of the Gaussians, so that methods agree on z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.optical_model import FieldMap
+from mems6dof_ros.calibration.psf_fit import (
+    COUNT,
+    DIAMETER,
+    PLACE,
+    REACH,
+    SLOPE,
+    STAGE,
+    WAVEFRONT,
+    BeadWindows,
+    Retrieval,
+    retrieve,
+)
+from mems6dof_ros.calibration.psf_pupil import PUPIL_TERMS, Imaging, PupilImages
+from mems6dof_ros.calibration.zernike import zernike, zernike_count
+
+#: Field orders that cross-validation chooses from, for every coefficient by itself.
+FIELD_ORDERS = (0, 1, 2, 3, 4)
+#: Margin of rendered windows about those of the data, px.
+MARGIN_PX = 14
+_MANY_BEADS = 20
+_LEAST_SCATTER = 1e-10
+
+
+@dataclass(frozen=True)
+class PsfModel:
+    """The pupil over the field and the scatter of particles about it.
+
+    ``wavefront`` (terms, Zernike terms of the field) waves rms, in the order of PUPIL_TERMS; ``slope``
+    (2, Zernike terms) rad of the chief ray; both on a disc of ``radius`` m, filled up with zeros where a term
+    needs a lower order. ``ln_diameter``: of the mean diameter over the nominal one. ``focus``: z of zero defocus,
+    ``focus_variance`` m^2. ``scatter`` (terms + 1, terms + 1): covariance of single particles' coefficients
+    and ln diameter. ``interval`` m: defocus that the beads covered. ``misfit``: rms of what the beads' images
+    differ from the model beyond noise, relative to their light.
+    """
+
+    imaging: Imaging
+    radius: float
+    wavefront: Array
+    slope: Array
+    ln_diameter: float
+    focus: FieldMap
+    focus_variance: float
+    scatter: Array
+    interval: tuple[float, float]
+    misfit: float
+
+    def at(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Wavefronts (n, terms) waves and chief-ray slopes (n, 2) rad at field positions (n,) m."""
+        count = self.wavefront.shape[1]
+        order = next(order for order in range(count) if zernike_count(order) == count)
+        terms = zernike(order, x / self.radius, y / self.radius)
+        return terms @ self.wavefront.T, terms @ self.slope.T
+
+
+@dataclass(frozen=True)
+class PsfBead:
+    """What the fit needs of a bead: its ``windows``, field position ``x``, ``y`` m, first guess of the stage
+    position of focus ``stage_z`` m and of its ``place_px`` (column, row)."""
+
+    windows: BeadWindows
+    x: float
+    y: float
+    stage_z: float
+    place_px: tuple[float, float]
+
+
+#: Fits stage positions (b,) m of focus over the field: the surface and its variance, m^2.
+FitFocus = Callable[[Array], tuple[FieldMap, float]]
+
+
+def fit_psf(
+    beads: Sequence[PsfBead],
+    imaging: Imaging,
+    radius: float,
+    interval: tuple[float, float],
+    heights: Array,
+    focus: FitFocus,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[PsfModel, list[Retrieval]]:
+    """Fit the pupil over the field to ``beads``.
+
+    ``heights`` (b,) m: z of each bead in the convention of the forward model, plus its stage position, which
+    fixes the origin of z. ``interval`` m: defocus to declare covered. Returns the model and every bead's
+    own pupil.
+    """
+    side = beads[0].windows.electrons.shape[1] + MARGIN_PX
+    pupil = PupilImages(imaging, side + -side % 4)
+    reach = REACH * imaging.wavelength / imaging.numerical_aperture**2
+    found: list[Retrieval] = []
+    # From the middle of the field outwards, so that each bead can start from its neighbour's pupil.
+    places = np.array([(bead.x, bead.y) for bead in beads])
+    order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T))
+    results: dict[int, Retrieval] = {}
+    for done, index in enumerate(order):
+        bead = beads[index]
+        start, centre = np.zeros(COUNT), np.zeros(COUNT)
+        if results:
+            near = min(results, key=lambda k: float(np.hypot(*(places[k] - places[index]))))
+            start[SLOPE.start :] = results[near].parameters[SLOPE.start :]
+        start[STAGE], start[PLACE] = bead.stage_z * 1e6, bead.place_px
+        centre[STAGE], centre[PLACE] = start[STAGE], start[PLACE]
+        results[int(index)] = retrieve(bead.windows.near(bead.stage_z, reach), pupil, start, centre)
+        progress(done + 1, len(beads))
+    found = [results[index] for index in range(len(beads))]
+    return _model(places, found, imaging, radius, interval, heights, focus), found
+
+
+def _model(
+    places: Array,
+    found: Sequence[Retrieval],
+    imaging: Imaging,
+    radius: float,
+    interval: tuple[float, float],
+    heights: Array,
+    focus: FitFocus,
+) -> PsfModel:
+    values = np.array([r.parameters for r in found])
+    noise = np.mean([r.covariance for r in found], axis=0)
+    beads = len(values)
+    fitted = [_smooth(places / radius, values[:, k]) for k in range(SLOPE.start, DIAMETER)]
+    terms = max(len(coefficients) for coefficients, _ in fitted)
+    field = np.array([np.pad(c, (0, terms - len(c))) for c, _ in fitted])
+    slopes = SLOPE.stop - SLOPE.start
+    mean_diameter = float(np.mean(values[:, DIAMETER]))
+    # Own departures, as large as they would be had the bead not taken part, and as uncertain as the
+    # field there.
+    own = np.column_stack(
+        [left_out for _, left_out in fitted[slopes:]]
+        + [(values[:, DIAMETER] - mean_diameter) * beads / max(beads - 1, 1)]
+    )
+    scatter = own.T @ own / beads - noise[WAVEFRONT.start :, WAVEFRONT.start :]
+    apart = max(0.0, 1 - beads / _MANY_BEADS)
+    scatter = (1 - apart) * scatter + apart * np.diag(np.diag(scatter))
+    stages = values[:, STAGE] * 1e-6
+    surface, variance = focus(stages)
+    piston = float(np.mean(heights - stages - surface(*places.T)))
+    coefficients = surface.coefficients.copy()
+    coefficients[0] += piston
+    return PsfModel(
+        imaging,
+        radius,
+        field[slopes:],
+        field[:slopes] * imaging.pixel_size * 1e6,
+        mean_diameter,
+        FieldMap(radius, coefficients),
+        variance,
+        _positive(scatter),
+        (interval[0] - piston, interval[1] - piston),
+        float(np.sqrt(np.mean([r.misfit**2 for r in found]))),
+    )
+
+
+def _smooth(places: Array, values: Array) -> tuple[Array, Array]:
+    """Zernike coefficients of ``values`` (b,) at ``places`` (b, 2) of the order that predicts beads left out
+    best, and how far each bead lies from what the others predict (b,)."""
+    best: tuple[float, Array, Array] | None = None
+    for order in FIELD_ORDERS:
+        design = zernike(order, *places.T)
+        if order > 0 and design.shape[1] > len(values) / 2:
+            break
+        inverse = np.linalg.pinv(design)
+        leverage = np.einsum("bj,jb->b", design, inverse)
+        left_out = (values - design @ (inverse @ values)) / np.maximum(1 - leverage, 1e-3)
+        score = float(np.mean(left_out**2))
+        if best is None or score < 0.98 * best[0]:
+            best = score, inverse @ values, left_out
+    assert best is not None
+    return best[1], best[2]
+
+
+def _positive(matrix: Array) -> Array:
+    """The nearest positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, _LEAST_SCATTER)) @ vectors.T
+
+
+class Fields(Protocol):
+    """Reads checked values by name (see file.py)."""
+
+    def section(self, name: str) -> Fields: ...
+    def array(self, name: str, *shape: int) -> Array: ...
+    def number(self, name: str) -> float: ...
+    def interval(self, name: str) -> tuple[float, float]: ...
+
+
+def content(model: PsfModel) -> dict[str, Any]:
+    """Plain values of ``model`` for the calibration file; ``read`` is the inverse."""
+    imaging = model.imaging
+    return {
+        "numerical_aperture": float(imaging.numerical_aperture),
+        "wavelength_m": float(imaging.wavelength),
+        "nominal_diameter_m": float(imaging.diameter),
+        "pixel_size_m": float(imaging.pixel_size),
+        "disc_radius_m": float(model.radius),
+        "pupil_terms_osa": list(PUPIL_TERMS),
+        "wavefront_waves": model.wavefront.tolist(),
+        "chief_ray_slope_rad": model.slope.tolist(),
+        "ln_diameter_over_nominal": float(model.ln_diameter),
+        "focus_surface_m": model.focus.coefficients.tolist(),
+        "focus_variance_m2": float(model.focus_variance),
+        "scatter_covariance": model.scatter.tolist(),
+        "defocus_interval_m": [float(v) for v in model.interval],
+        "misfit": float(model.misfit),
+    }
+
+
+def read(fields: Fields) -> PsfModel:
+    """The model that ``content`` described; InputError for what it could not have been."""
+    terms = len(PUPIL_TERMS)
+    radius = fields.number("disc_radius_m")
+    wavefront = fields.array("wavefront_waves", terms, -1)
+    return PsfModel(
+        Imaging(
+            fields.number("numerical_aperture"),
+            fields.number("wavelength_m"),
+            fields.number("nominal_diameter_m"),
+            fields.number("pixel_size_m"),
+        ),
+        radius,
+        wavefront,
+        fields.array("chief_ray_slope_rad", 2, wavefront.shape[1]),
+        fields.number("ln_diameter_over_nominal"),
+        FieldMap(radius, fields.array("focus_surface_m", -1)),
+        fields.number("focus_variance_m2"),
+        fields.array("scatter_covariance", terms + 1, terms + 1),
+        fields.interval("defocus_interval_m"),
+        fields.number("misfit"),
+    )

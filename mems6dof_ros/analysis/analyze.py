@@ -22,6 +22,7 @@ from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.recording.bag import BagWriter
 from mems6dof_ros.recording.frames import write_frame
+from mems6dof_ros.recording.poses import pose_messages
 from mems6dof_ros.recording.tables import CYCLES, LOCALIZATIONS, TableWriter, sightings
 from mems6dof_ros.sources.source import FrameSource
 
@@ -199,12 +200,8 @@ def _write(
     if keep_images:
         bag.write_message(f"/{topics.IMAGE}", messages.image(frame), frame.stamp_ns)
     bag.write_message(f"/{topics.LOCALIZATIONS}", messages.localizations(found), frame.stamp_ns)
-    for pose in poses:
-        bag.write_message(f"/{topics.POSE_6DOF}", messages.pose6dof(pose), frame.stamp_ns)
-        if pose.valid:
-            bag.write_message(f"/{topics.POSE}", messages.pose_stamped(pose), frame.stamp_ns)
-            covariant = messages.pose_with_covariance_stamped(pose)
-            bag.write_message(f"/{topics.POSE_WITH_COVARIANCE}", covariant, frame.stamp_ns)
+    for topic, message in pose_messages(poses):
+        bag.write_message(f"/{topic}", message, frame.stamp_ns)
 
 
 def _keep_constellation(estimator: PoseEstimator, out: Path) -> None:

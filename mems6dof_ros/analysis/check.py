@@ -81,9 +81,8 @@ def _frame_problems(name: str, frames: _Topic, seen: dict[str, _Topic]) -> list[
         problems.append(f"{name}: {unaccounted} frames neither recorded nor reported lost")
     if repeated := sum(count - 1 for count in frames.stamps.values()):
         problems.append(f"{name}: {repeated} frames with the stamp of another")
-    namespace = name.rsplit("/", 1)[0]
     for other, topic in seen.items():
-        if topic.kind in _OF_A_FRAME and other.rsplit("/", 1)[0] == namespace:
+        if topic.kind in _OF_A_FRAME and _frame_info_of(other, seen) == name:
             missing = len(frames.stamps.keys() - topic.stamps.keys())
             foreign = len(topic.stamps.keys() - frames.stamps.keys())
             if missing:
@@ -91,3 +90,14 @@ def _frame_problems(name: str, frames: _Topic, seen: dict[str, _Topic]) -> list[
             if foreign:
                 problems.append(f"{other}: {foreign} messages of frames that {name} does not know")
     return problems
+
+
+def _frame_info_of(topic: str, seen: dict[str, _Topic]) -> str | None:
+    """The FrameInfo nearest above ``topic``: in its namespace or, of a further body, in the one around it."""
+    infos = {name.rsplit("/", 1)[0]: name for name, found in seen.items() if found.kind == _FRAME_INFO}
+    namespace = topic
+    while "/" in namespace:
+        namespace = namespace.rsplit("/", 1)[0]
+        if namespace in infos:
+            return infos[namespace]
+    return None

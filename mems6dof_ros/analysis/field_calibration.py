@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,7 @@ def calibrate_field(
         field = FieldError.assumed(settings, np.array([width, height]) / 2)
     if len(field.modes) == 0:
         raise InputError("field calibration", "no field error in the settings", "a field_degree above 0")
-    earlier = calibration.correction.provenance["recordings"] if calibration.correction else []
-    if any(other["sha256"] == sha256 for other in earlier):
+    if any(other["sha256"] == sha256 for other in _recordings(calibration)):
         raise InputError("field calibration", f"{name} for the second time", "another recording")
     bodies = make_bodies(settings, field)
     count, poses = 0, {estimator.body: 0 for estimator in bodies.estimators}
@@ -72,19 +72,7 @@ def calibrate_field(
             f"field calibration: {name}", f"no valid pose in {count} cycles", "a body that turns"
         )
     field = bodies.measured_field()
-    learnt = {
-        "recording": name,
-        "sha256": sha256,
-        "calibration_id": calibration.calibration_id,
-        "cycles": count,
-        "poses": poses,
-    }
-    provenance = {
-        "made_by": f"mems6dof {__version__}",
-        "prior": {"field_sd_xy_m": settings.field_sd_xy, "field_sd_z_m": settings.field_sd_z},
-        "recordings": [*earlier, learnt],
-    }
-    corrected = calibration.corrected(field.modes, field.mean, field.covariance, provenance)
+    corrected = with_field_error(calibration, field, settings, name, poses, count, sha256)
     modes = _modes_over_field(field)
     return FieldCalibration(
         corrected,
@@ -94,6 +82,37 @@ def calibrate_field(
         _rms(modes, field.prior),
         _rms(modes, field.covariance),
     )
+
+
+def with_field_error(
+    calibration: Calibration,
+    field: FieldError,
+    settings: PoseSettings,
+    name: str,
+    poses: Mapping[str, int],
+    cycles: int,
+    sha256: str = "",
+) -> Calibration:
+    """``calibration`` with the ``field`` error that was measured by it in ``cycles``, and where that is from:
+    ``name`` of the recording and, of a file, its ``sha256``; ``poses``: valid ones by body."""
+    learnt = {
+        "recording": name,
+        "sha256": sha256,
+        "calibration_id": calibration.calibration_id,
+        "cycles": cycles,
+        "poses": dict(poses),
+    }
+    provenance = {
+        "made_by": f"mems6dof {__version__}",
+        "prior": {"field_sd_xy_m": settings.field_sd_xy, "field_sd_z_m": settings.field_sd_z},
+        "recordings": [*_recordings(calibration), learnt],
+    }
+    return calibration.corrected(field.modes, field.mean, field.covariance, provenance)
+
+
+def _recordings(calibration: Calibration) -> Sequence[Mapping[str, Any]]:
+    """What the field correction of ``calibration`` was learnt from."""
+    return calibration.correction.provenance["recordings"] if calibration.correction else ()
 
 
 def localizations_of(path: Path, calibration: Calibration) -> Iterator[Localizations] | None:

@@ -82,7 +82,8 @@ class PipelineNode(frame_source.FrameSourceNode):
         )
         found = replace(found, latency=latency, published_ns=localized_ns)
         try:
-            self._localization.observe(self._pose.estimate(found, localized_ns))
+            for pose in self._pose.estimate(found, localized_ns):
+                self._localization.observe(pose)
         except InputError as error:
             self.health.refused(str(error))
         self._localization.publish(found)

@@ -1,8 +1,10 @@
-"""``pose_estimator``: particles to the pose of the gear, once per motion cycle.
+"""``pose_estimator``: particles to the poses of one or more rigid bodies, once per motion cycle.
 
 Subscribes to ``localizations``; publishes ``pose_6dof`` for every one of them, and ``pose`` and
-``pose_with_covariance`` while the pose is valid, all with the header of the frame. Services
-(std_srvs/Trigger): ``~/reset``, ``~/set_reference``.
+``pose_with_covariance`` while the pose is valid, all with the header of the frame. Each body after the first
+has these topics below its own name, and there ``relative_pose`` (PoseWithCovarianceStamped): its pose in the
+body frame of the first, whose name is the frame_id. Services (std_srvs/Trigger), for all bodies: ``~/reset``,
+``~/set_reference``, ``~/save_field_correction``.
 """
 
 from __future__ import annotations
@@ -10,24 +12,32 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_srvs.srv import Trigger
 
 from mems6dof_msgs.msg import Localizations as LocalizationsMessage
-from mems6dof_msgs.msg import Pose6DOF
+from mems6dof_ros.analysis.field_calibration import with_field_error
+from mems6dof_ros.calibration.file import Calibration, load_calibration, save_calibration
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.pose.bodies import Bodies
+from mems6dof_ros.pose.bodies_file import load_bodies
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
+from mems6dof_ros.pose.field import FieldError
 from mems6dof_ros.pose.settings import PoseSettings
 from mems6dof_ros.pose.synthetic import Scene, SyntheticGear
 from mems6dof_ros.recording import messages, topics
+from mems6dof_ros.recording.poses import pose_messages, pose_topics
 
 _SETTINGS = {
     "reference": (
@@ -58,7 +68,20 @@ _SETTINGS = {
 }  # fmt: skip
 
 PARAMETERS = (
-    Parameter("body", "load_gear", "Name of the rigid body in the messages."),
+    Parameter("body", "load_gear", "Name of the rigid body in the messages, where there is but one."),
+    Parameter("bodies", "", "File of several rigid bodies (docs/files.md); empty: one, of the name above."),
+    Parameter(
+        "calibration",
+        "",
+        "Calibration file of the localizer: the field error begins with what its field correction leaves"
+        " uncertain; empty: with the field_sd below.",
+    ),
+    Parameter(
+        "field_correction",
+        "",
+        "Calibration file that ~/save_field_correction writes: that one, corrected by the field error as"
+        " measured by then.",
+    ),
     *QUEUE_PARAMETERS,
     WAIT_PARAMETER,
     *of_settings(PoseSettings, "", _SETTINGS),
@@ -71,25 +94,35 @@ class PoseOutput:
     def __init__(self, node: InstrumentNode) -> None:
         self._node = node
         self.settings = to_settings(PoseSettings, "", node.values)
-        self._estimator = PoseEstimator(self.settings, node.values["body"])
-        self._using_estimator = threading.Lock()
+        path = node.values["calibration"]
+        self._calibration: Calibration | None = load_calibration(path) if path else None
+        self._bodies = make_bodies(node.values, self.settings, self._calibration)
+        self._using_bodies = threading.Lock()
+        self._cycles, self._valid = 0, Counter[str]()
         self._last_counter: int | None = None
+        names = [estimator.body for estimator in self._bodies.estimators]
         self.publishers = {
-            topic: node.create_publisher(kind, topic, transport.MESSAGES)
-            for topic, kind in (
-                (topics.POSE_6DOF, Pose6DOF),
-                (topics.POSE, PoseStamped),
-                (topics.POSE_WITH_COVARIANCE, PoseWithCovarianceStamped),
-            )
+            topic: node.create_publisher(messages.rclpy_type(kind), topic, transport.MESSAGES)
+            for topic, kind in pose_topics(names).items()
         }
-        node.create_service(Trigger, "~/reset", self._on_reset)
-        node.create_service(Trigger, "~/set_reference", self._on_set_reference)
+        for name, act in (
+            ("reset", self._reset),
+            ("set_reference", self._set_reference),
+            ("save_field_correction", self._save_field_correction),
+        ):
+            node.create_service(Trigger, f"~/{name}", _served(act))
 
-    def estimate(self, found: Localizations, arrival_ns: int) -> CyclePose:
-        """The pose, published; raises as PoseEstimator.update. ``arrival_ns`` of ``found``, host clock."""
+    def estimate(self, found: Localizations, arrival_ns: int) -> list[CyclePose]:
+        """The pose of each body, published. ``arrival_ns`` of ``found``, host clock. Raises InputError where
+        ``found`` is malformed or by another calibration than the one that we were told."""
         self._account(found)
-        with self._using_estimator:
-            cycle_pose = self._estimator.update(found)
+        if self._calibration and len(found) and found.calibration_id != self._calibration.calibration_id:
+            by = f"by calibration {found.calibration_id or 'none'}"
+            raise InputError("localizations", by, f"{self._calibration.calibration_id}, the parameter's")
+        with self._using_bodies:
+            poses = self._bodies.update(found)
+            self._cycles += 1
+            self._valid.update(pose.body for pose in poses if pose.valid)
         published_ns = time.time_ns()
         latency = replace(
             found.latency,
@@ -97,28 +130,26 @@ class PoseOutput:
             pose=(published_ns - arrival_ns) * 1e-9,
             total=(published_ns - found.frame_published_ns) * 1e-9 if found.frame_published_ns else NAN,
         )
-        cycle_pose = replace(cycle_pose, latency=latency)
-        self._publish(cycle_pose)
-        return cycle_pose
+        poses = [replace(pose, latency=latency) for pose in poses]
+        for topic, message in pose_messages(poses):
+            self.publishers[topic].publish(messages.to_rclpy(message))
+        self._report(poses)
+        return poses
 
-    def _publish(self, cycle_pose: CyclePose) -> None:
-        self.publishers[topics.POSE_6DOF].publish(messages.to_rclpy(messages.pose6dof(cycle_pose)))
-        if cycle_pose.valid:
-            pose = messages.pose_stamped(cycle_pose)
-            covariant = messages.pose_with_covariance_stamped(cycle_pose)
-            self.publishers[topics.POSE].publish(messages.to_rclpy(pose))
-            self.publishers[topics.POSE_WITH_COVARIANCE].publish(messages.to_rclpy(covariant))
-        health = self._node.health
-        health.state = cycle_pose.status.name.lower() + (
-            f": {cycle_pose.reason}" if cycle_pose.reason else ""
-        )
-        health.count("poses")
-        health.count(f"poses {cycle_pose.status.name.lower()}")
-        health.set("particles used", cycle_pose.particles_used)
-        health.set("residual xy, nm", f"{cycle_pose.residual_rms_xy * 1e9:.2f}")
-        health.set("residual z, nm", f"{cycle_pose.residual_rms_z * 1e9:.1f}")
-        health.time("pose", cycle_pose.latency.pose)
-        health.time("frame to pose", cycle_pose.latency.total)
+    def _report(self, poses: list[CyclePose]) -> None:
+        health, states = self._node.health, []
+        for pose in poses:
+            of = f"{pose.body} " if len(poses) > 1 else ""
+            status = pose.status.name.lower()
+            states.append(f"{of}{status}" + (f": {pose.reason}" if pose.reason else ""))
+            health.count(f"{of}poses")
+            health.count(f"{of}poses {status}")
+            health.set(f"{of}particles used", pose.particles_used)
+            health.set(f"{of}residual xy, nm", f"{pose.residual_rms_xy * 1e9:.2f}")
+            health.set(f"{of}residual z, nm", f"{pose.residual_rms_z * 1e9:.1f}")
+        health.state = "; ".join(states)
+        health.time("pose", poses[0].latency.pose)
+        health.time("frame to pose", poses[0].latency.total)
 
     def _account(self, found: Localizations) -> None:
         """Count the localizations that were lost on the way here."""
@@ -126,26 +157,60 @@ class PoseOutput:
         if last is not None and (lost := found.frame_counter - last - 1 - found.frames_dropped) > 0:
             self._node.health.lost(lost, f"{lost} localizations lost before frame {found.frame_counter}")
 
-    # Services -----------------------------------------------------------------------------------
+    # Services: each returns what to answer, or raises InputError -----------------------------------
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        with self._using_estimator:
-            self._estimator.reset()
-        response.success, response.message = True, "the next cycle founds a new reference"
-        return response
+    def _reset(self) -> str:
+        with self._using_bodies:
+            self._bodies.reset()
+            self._cycles, self._valid = 0, Counter()
+        return "the next cycle founds a new reference"
 
-    def _on_set_reference(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _set_reference(self) -> str:
+        with self._using_bodies:
+            versions = {estimator.body: estimator.set_reference() for estimator in self._bodies.estimators}
+        return "reference version " + ", ".join(
+            f"{version} of {body}" if len(versions) > 1 else f"{version}"
+            for body, version in versions.items()
+        )
+
+    def _save_field_correction(self) -> str:
+        path = self._node.values["field_correction"]
+        if not path or self._calibration is None:
+            raise InputError("field correction", "no parameter field_correction or calibration", "both")
+        with self._using_bodies:
+            corrected = with_field_error(
+                self._calibration,
+                self._bodies.measured_field(),
+                self.settings,
+                f"live, {self._node.get_fully_qualified_name()}",
+                self._valid,
+                self._cycles,
+            )
+        save_calibration(corrected, path)
+        return f"calibration {corrected.calibration_id} in {path}"
+
+
+def _served(act: Callable[[], str]) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            with self._using_estimator:
-                version = self._estimator.set_reference()
-            response.success, response.message = True, f"reference version {version}"
+            response.success, response.message = True, act()
         except InputError as error:
             response.success, response.message = False, str(error)
         return response
 
+    return answer
+
+
+def make_bodies(values: Mapping[str, Any], settings: PoseSettings, calibration: Calibration | None) -> Bodies:
+    """The bodies that the parameters describe; InputError where they cannot be told apart."""
+    field = FieldError.remaining(calibration.correction if calibration else None, settings)
+    if values["bodies"]:
+        return load_bodies(Path(values["bodies"]), settings, field)
+    return Bodies([PoseEstimator(settings, values["body"], field=field)])
+
 
 class PoseEstimatorNode(InstrumentNode):
-    """PoseEstimator behind a queue."""
+    """PoseEstimators behind a queue."""
 
     def __init__(self) -> None:
         super().__init__("pose_estimator", PARAMETERS)

@@ -27,8 +27,10 @@ from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import PARENT_VARIABLE, WAIT_PARAMETER
 from mems6dof_ros.nodes.parameters import to_yaml
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
+from mems6dof_ros.pose.bodies_file import load_bodies
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.frames import camera_to_json
+from mems6dof_ros.recording.poses import pose_topics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
 
@@ -83,6 +85,7 @@ def chain(
     source: NodeSpec | None,
     *,
     calibration: str,
+    bodies: str = "",
     output: str = "",
     queue_policy: str = "block",
     image_topic: str = topics.IMAGE,
@@ -98,34 +101,43 @@ def chain(
 
     ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for the
     subscribers that the table gives it, and for those in ``watched`` (topic to the name of a node that is
-    not in the table), so that nothing is lost at the beginning. Nobody waits for a monitor.
+    not in the table), so that nothing is lost at the beginning. Nobody waits for a monitor. ``bodies``: file
+    of several bodies in view, whose topics are recorded too.
     """
+    further = _topics_of_further(bodies)
     queue = {"queue_policy": queue_policy}
     remap = {topics.IMAGE: image_topic} if image_topic != topics.IMAGE else {}
     if arrangement == "pipeline":
-        nodes = [_in_one_process(source, calibration)]
+        nodes = [_in_one_process(source, calibration, bodies)]
     elif arrangement == "processes":
         nodes = [source] if source else []
         nodes.append(NodeSpec("localizer", {"calibration": calibration, **queue}, remap))
-        nodes.append(NodeSpec("pose_estimator", queue))
+        nodes.append(NodeSpec("pose_estimator", {"calibration": calibration, "bodies": bodies, **queue}))
     else:
         raise InputError("argument arrangement", f"'{arrangement}'", "processes or pipeline")
     if controller:
         nodes.append(controller)
     if output:
-        attachments = {"attachments": [calibration]} if calibration else {}
         recorder = {
             "output": output,
-            "topics": list(recorded),
+            "topics": [*recorded, *further],
             "compression": compression,
-            **attachments,
+            "attachments": [file for file in (calibration, bodies) if file],
         }
         nodes.append(NodeSpec("recorder", recorder, remap))
     if monitor:
         nodes.append(replace(monitor, remappings=remap))
     subscribed = [(topic, node.executable) for node in nodes for topic in _subscriptions(node)]
     subscribed += (watched or {}).items()
-    return [_waiting_for_subscribers(node, subscribed) for node in nodes]
+    return [_waiting_for_subscribers(node, subscribed, further) for node in nodes]
+
+
+def _topics_of_further(bodies: str) -> list[str]:
+    """Topics of the bodies after the first in the file ``bodies``."""
+    if not bodies:
+        return []
+    names = [estimator.body for estimator in load_bodies(Path(bodies)).estimators]
+    return [topic for topic in pose_topics(names) if topic not in pose_topics(names[:1])]
 
 
 def simulated(cycles: int, **settings: Any) -> NodeSpec:
@@ -153,18 +165,23 @@ def _finite(kind: str, options: Mapping[str, Any]) -> NodeSpec:
     return NodeSpec("frame_source", {"source": kind, **pacing, **options}, ends_system=True)
 
 
-def _in_one_process(source: NodeSpec | None, calibration: str) -> NodeSpec:
+def _in_one_process(source: NodeSpec | None, calibration: str, bodies: str) -> NodeSpec:
     if source is None:
         found = "pipeline without a source of ours"
         raise InputError("argument arrangement", found, "processes, where somebody else publishes the images")
     parameters = {name: value for name, value in source.parameters.items() if name != "acknowledged_by"}
     if parameters["pacing"] == "consumer":
         parameters |= {"pacing": "rate", "rate": 0.0}  # what is called is waited for
-    return replace(source, executable="pipeline", parameters={**parameters, "calibration": calibration})
+    parameters |= {"calibration": calibration, "bodies": bodies}
+    return replace(source, executable="pipeline", parameters=parameters)
 
 
-def _waiting_for_subscribers(node: NodeSpec, subscribed: Sequence[tuple[str, str]]) -> NodeSpec:
+def _waiting_for_subscribers(
+    node: NodeSpec, subscribed: Sequence[tuple[str, str]], further: Sequence[str]
+) -> NodeSpec:
     published = _PUBLISHED.get(node.executable, ())
+    if topics.POSE_6DOF in published:
+        published = (*published, *further)
     waits = [f"{topic}:{name}" for topic, name in subscribed if topic in published]
     return replace(node, parameters={**node.parameters, WAIT_PARAMETER.name: waits}) if waits else node
 
@@ -239,6 +256,7 @@ def _common(values: Mapping[str, str]) -> dict[str, Any]:
     """What ``chain`` is told by the arguments that every system has."""
     return {
         "calibration": values["calibration"],
+        "bodies": values["bodies"],
         "output": values["output"],
         "monitor": _monitor(values),
         "arrangement": values["arrangement"],
@@ -251,7 +269,10 @@ def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
     return NodeSpec("monitor") if values["monitor"] == "true" else None
 
 
-_CALIBRATION = {"calibration": ("", "Calibration file; empty: x and y only")}
+_CALIBRATION = {
+    "calibration": ("", "Calibration file; empty: x and y only"),
+    "bodies": ("", "File of several rigid bodies in view (docs/files.md); empty: one"),
+}
 _OUTPUT = {"output": ("", "Directory of the bag to record; empty: none")}
 _ARRANGEMENT = {
     "arrangement": (

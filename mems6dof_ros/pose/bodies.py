@@ -70,9 +70,10 @@ class Bodies:
     def _share_field(self, localizations: Localizations) -> None:
         """One field error for all, over the field as all their particles show it."""
         settings = self.estimators[0].settings
-        if self.estimators[0].field is not None:
+        if len(self.estimators) == 1 or self.estimators[0].field is not None:
             return
-        seen = usable(localizations).position[:, :2]
+        view = usable(localizations)
+        seen = view.position[view.good, :2]
         if len(seen) >= settings.min_particles:
             field = FieldError.assumed(settings, np.abs(seen).max(axis=0))
             for estimator in self.estimators:

@@ -16,6 +16,7 @@ Settings of the field error are common to all bodies, because their optics are.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -51,6 +52,9 @@ def load_bodies(path: Path, settings: PoseSettings | None = None, field: FieldEr
     settings, bodies = replace(settings or PoseSettings(), **common), content.get("bodies")
     if not isinstance(bodies, dict) or not bodies:
         raise InputError(str(path), "no bodies", "'bodies:' with one entry for each")
+    for name in bodies:
+        if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", str(name)):
+            raise InputError(f"{path}: body {name}", "this name", "letters, digits and _, as in a topic")
     return Bodies([_estimator(str(name), entry, path, settings, field) for name, entry in bodies.items()])
 
 

@@ -17,6 +17,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--address",
         help="address to listen on; other than localhost, a token is asked for (default: 127.0.0.1)",
     )
+    parser.add_argument("--tls-cert", help="PEM file: serve https instead of http; needs --tls-key")
+    parser.add_argument("--tls-key", help="PEM file of the certificate's private key")
     parser.add_argument("ros_args", nargs="*", metavar="-- ROS arguments", help="for example -r __ns:=/left")
     parser.set_defaults(run=run)
 
@@ -24,10 +26,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(options: argparse.Namespace) -> int:
     """Run the node until it is interrupted; returns the exit status."""
     from mems6dof_ros.nodes import monitor  # needs ROS, the other commands do not
+    from mems6dof_ros.nodes.parameters import to_yaml
 
-    parameters = {"port": options.port, "address": options.address}
+    parameters = {
+        "port": options.port,
+        "address": options.address,
+        "tls_certificate": options.tls_cert,
+        "tls_key": options.tls_key,
+    }
     arguments = ["--ros-args", *options.ros_args]
     for name, value in parameters.items():
         if value is not None:
-            arguments += ["-p", f"{name}:={value}"]
+            arguments += ["-p", f"{name}:={to_yaml(value)}"]
     return monitor.main(arguments)

@@ -7,10 +7,12 @@ Protocol of the WebSocket. Numbers are SI. To the page, text is JSON with a ``ty
     2, bytes of JSON j, bytes of JPEG, 0, then the JSON padded with blanks to j, then the JPEG
 
 From the page, text only, at most MAX_MESSAGE bytes: ``call`` a service (some with a number), set a ``limit``,
-``remove_limit``, ``pictures`` wanted or not. Anything else closes the connection.
+``remove_limit``, ``pictures`` wanted or not, and ``seen`` once a picture is drawn. Anything else closes the
+connection.
 
-What waits for a page is bounded: rows wait in the history that all pages share, of pictures and states only
-the newest is ever sent, and a page that takes nothing for _SEND_TIMEOUT is closed.
+What waits for a page is bounded: rows wait in the history that all pages share; of pictures and states only
+the newest is ever sent, a picture when the one before has been seen, so that a slow line shows fewer and not
+older ones; and a page that takes nothing for _SEND_TIMEOUT is closed.
 """
 
 from __future__ import annotations
@@ -212,7 +214,13 @@ class MonitorServer:
             socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER
         )
         self._pages.add(page_socket)
-        page = _Page(self._feed, page_socket, self._call)
+
+        def too_slow() -> None:
+            self._log_refusal(request, f"takes nothing for {_SEND_TIMEOUT:.0f} s")
+            if request.transport is not None:
+                request.transport.abort()  # it would not take a goodbye either
+
+        page = _Page(self._feed, page_socket, self._call, too_slow)
         sender = asyncio.create_task(page.send())
         try:
             await page.receive()
@@ -246,11 +254,15 @@ class MonitorServer:
 class _Page:
     """One open page: what it has been sent, and what it asks for."""
 
-    def __init__(self, feed: Feed, socket: web.WebSocketResponse, call: Caller) -> None:
+    def __init__(
+        self, feed: Feed, socket: web.WebSocketResponse, call: Caller, too_slow: Callable[[], None]
+    ) -> None:
         self._feed = feed
         self._socket = socket
         self._call = call
+        self._too_slow = too_slow
         self._wants_pictures = False
+        self._unseen = False  # a picture is on its way
         self._received: deque[float] = deque(maxlen=MAX_MESSAGES_PER_SECOND)
 
     def leave(self) -> None:
@@ -285,8 +297,8 @@ class _Page:
                 last_state = state
                 await self._send(self._socket.send_str(state))
             number, picture = self._feed.picture()
-            if picture is not None and number != last_picture and self._wants_pictures:
-                last_picture = number
+            if picture and number != last_picture and self._wants_pictures and not self._unseen:
+                last_picture, self._unseen = number, True
                 await self._send(self._socket.send_bytes(_pack_picture(picture)))
             await asyncio.sleep(max(_TICK - (time.monotonic() - started), 0.001))
 
@@ -298,7 +310,7 @@ class _Page:
         try:
             await asyncio.wait_for(sending, _SEND_TIMEOUT)
         except asyncio.TimeoutError:
-            await self._socket.close(code=1013, message=b"too slow")
+            self._too_slow()
             raise
 
     # From the page ------------------------------------------------------------------------------
@@ -335,6 +347,8 @@ class _Page:
                 self._feed.remove_limit(quantity)
             case {"type": "pictures", "on": bool(on), **rest} if not rest:
                 self._set_pictures(on)
+            case {"type": "seen", **rest} if not rest:
+                self._unseen = False
             case _:
                 raise _Refused(f"not a request: {_shown(json.dumps(request))}")
 
@@ -354,7 +368,7 @@ class _Page:
 
     def _set_pictures(self, on: bool) -> None:
         self._feed.watchers += int(on) - int(self._wants_pictures)
-        self._wants_pictures = on
+        self._wants_pictures, self._unseen = on, False
 
 
 def _parse(text: str) -> dict[str, Any]:

@@ -379,7 +379,9 @@ def _reading(url: str) -> Iterator[None]:
         async with aiohttp.ClientSession() as session, _page_socket(session, url) as socket:
             await socket.send_json({"type": "pictures", "on": True})
             while not done.is_set():
-                await socket.receive(30)
+                message = await socket.receive(30)
+                if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 2:
+                    await socket.send_json({"type": "seen"})
 
     thread = threading.Thread(target=lambda: asyncio.run(read()), daemon=True)
     thread.start()

@@ -6,12 +6,12 @@ asks for. With nobody looking it only keeps numbers; docs/monitor.md has the res
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import threading
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable
 from concurrent.futures import Future
 from queue import Empty, Queue
 from typing import Any, TypeVar
@@ -19,12 +19,15 @@ from typing import Any, TypeVar
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
+from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock, ClockType
+from rclpy.parameter import parameter_value_to_python
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Image
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
+from mems6dof_msgs.msg import ControllerState, FrameInfo, GroundTruth, Localizations, Pose6DOF
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import GroundTruth as Truth
 from mems6dof_ros.monitor.feed import Feed
@@ -32,8 +35,11 @@ from mems6dof_ros.monitor.picture import make_picture
 from mems6dof_ros.monitor.server import MonitorServer
 from mems6dof_ros.monitor.truth import TruthAlignment
 from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.actuation import ANSWERS
 from mems6dof_ros.nodes.common import InstrumentNode, run
 from mems6dof_ros.nodes.parameters import Parameter
+from mems6dof_ros.nodes.polled import PolledSubscriptions
+from mems6dof_ros.nodes.scaled import ScaledCopies
 from mems6dof_ros.nodes.snapshots import Snapshots
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
@@ -42,8 +48,18 @@ PARAMETERS = (
     Parameter("address", "127.0.0.1", "Address to listen on; other than localhost, a token is asked for."),
     Parameter("port", 8606, "TCP port to listen on; 0: any free one.", span=(0, 65535)),
     Parameter("history", 30000, "Motion cycles that the page can show.", "cycles", (100, 1_000_000)),
+    Parameter("tls_certificate", "", "PEM file; with it and tls_key, the page is served by https."),
+    Parameter("tls_key", "", "PEM file of its private key, without a password."),
     Parameter(
         "picture_rate", 4.0, "Micrographs shown per second while a page is open; 0: none.", "Hz", (0.0, 30.0)
+    ),
+    Parameter(
+        "viz_scale",
+        0.0,
+        "Publish viz/pose and viz/points, lengths times this, for tools that cannot show micrometres; 1000"
+        " makes the gear 0.328 m wide; 0: do not.",
+        "1",
+        (0.0, 1e9),
     ),
 )
 #: Services that the page may call, relative names; all std_srvs/Trigger.
@@ -55,12 +71,24 @@ SERVICES = (
     "pose_estimator/reset",
     "recorder/start",
     "recorder/stop",
+    "controller/stop",
 )
+#: What the page may send the controller: a target, with its angle psi in rad.
+GO = "controller/go"
 #: Environment variable with the token to ask for; a parameter could be read by everybody on the network.
 TOKEN_VARIABLE = "MEMS6DOF_MONITOR_TOKEN"
 
+#: Parameters of the controller that the page shows.
+_LIMITS = ("body", "max_play", "max_tilt", "max_sd_psi", "max_pose_age", "move_timeout")
+_STATES = {
+    ControllerState.STATE_IDLE: "idle",
+    ControllerState.STATE_MOVING: "moving",
+    ControllerState.STATE_ARRIVED: "arrived",
+    ControllerState.STATE_STOPPED: "stopped",
+}
 _RATES = (topics.FRAME_INFO, topics.LOCALIZATIONS, topics.POSE_6DOF)
 _MEMORY_FRAMES = 256  # frames whose messages are kept until the picture of one of them is made
+_TAKE_PERIOD = 0.04  # s; as often as a page is sent anything
 _STATE_PERIOD = 0.5  # s
 _PICTURE_PATIENCE = 0.5  # s that a picture waits for its pose
 _STANDSTILL = 10.0  # s without a frame after which none are expected
@@ -94,6 +122,8 @@ class MonitorNode(InstrumentNode):
             address=self.values["address"],
             port=self.values["port"],
             token=os.environ.get(TOKEN_VARIABLE, ""),
+            certificate=self.values["tls_certificate"],
+            key=self.values["tls_key"],
             log=self._warn,
         )
         self._counts: Counter[str] = Counter()
@@ -110,6 +140,10 @@ class MonitorNode(InstrumentNode):
         self._infos: _Recent[int, FrameInfo] = _Recent()
         self._images: Queue[bytes | None] = Queue(maxsize=1)
         self._triggers = {name: self.create_client(Trigger, name) for name in SERVICES}
+        self._limits = self.create_client(GetParameters, "controller/get_parameters")
+        self._targets = self.create_publisher(Float64, topics.PSI_TARGET, transport.MESSAGES)
+        self._controller: dict[str, Any] | None = None  # what is known of it, None: nobody has seen one
+        self._controller_known = False
         self._painter = threading.Thread(target=self._paint, name="painter", daemon=True)
         # Printed, not logged: the address may hold a token, and logs and diagnostics are published.
         print(f"live page: {self._server.start()}", flush=True)
@@ -117,21 +151,21 @@ class MonitorNode(InstrumentNode):
         self.health.gauge("pages with pictures", lambda: self._feed.watchers)
 
     def activate(self) -> None:
-        def subscribe(kind: type, topic: str, callback: Callable[..., None], raw: bool = False) -> None:
-            self.create_subscription(kind, topic, callback, transport.MESSAGES, raw=raw)
-
-        # In the order in which a cycle comes about: an executor that lags takes them in this order.
-        subscribe(FrameInfo, topics.FRAME_INFO, self._on_frame_info)
-        subscribe(GroundTruth, topics.TRUTH, self._on_truth)
-        # Raw: only the few that are drawn are ever decoded.
-        subscribe(Localizations, topics.LOCALIZATIONS, self._on_localizations, raw=True)
-        subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
-        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics)
+        polled = PolledSubscriptions(self, _TAKE_PERIOD)
+        # In the order in which a cycle comes about, so that everything is there when its pose comes.
+        polled.subscribe(FrameInfo, topics.FRAME_INFO, self._on_frame_info)
+        polled.subscribe(GroundTruth, topics.TRUTH, self._on_truth)
+        polled.subscribe(Localizations, topics.LOCALIZATIONS, self._on_localizations)
+        polled.subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
+        polled.subscribe(ControllerState, topics.CONTROLLER_STATE, self._on_controller, ANSWERS)
+        polled.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics)
         # Wall time: the page lives also while simulated time stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_STATE_PERIOD, self._tell_state, clock=steady)
         if rate := self.values["picture_rate"]:
             Snapshots(self, topics.IMAGE, rate, self._wants_image, self._images.put)
+        if scale := self.values["viz_scale"]:
+            ScaledCopies(self, scale)
         self.tell("serving")
 
     def cleanup(self) -> None:
@@ -144,10 +178,10 @@ class MonitorNode(InstrumentNode):
 
     # What is heard ------------------------------------------------------------------------------
 
-    def _on_pose(self, message: Pose6DOF) -> None:
+    def _on_pose(self, data: bytes) -> None:
         self._counts[topics.POSE_6DOF] += 1
         try:
-            pose = messages.to_cycle_pose(message)
+            pose = messages.to_cycle_pose(deserialize_message(data, Pose6DOF))
         except InputError as error:
             self._feed.tell("warning", str(error))
             return
@@ -158,21 +192,38 @@ class MonitorNode(InstrumentNode):
     def _on_localizations(self, data: bytes) -> None:
         self._counts[topics.LOCALIZATIONS] += 1
         self._heard_at = time.monotonic()
-        self._found[transport.stamp_of(data)] = data
+        self._found[transport.stamp_of(data)] = data  # only the few that are drawn are ever decoded
 
-    def _on_frame_info(self, message: FrameInfo) -> None:
+    def _on_frame_info(self, data: bytes) -> None:
+        message = deserialize_message(data, FrameInfo)
         self._counts[topics.FRAME_INFO] += 1
         self._heard_at = time.monotonic()
         self._frames_dropped += message.frames_dropped
         self._infos[messages.nanoseconds(message.header.stamp)] = message
 
-    def _on_truth(self, message: GroundTruth) -> None:
+    def _on_truth(self, data: bytes) -> None:
+        message = deserialize_message(data, GroundTruth)
         self._truths[messages.nanoseconds(message.header.stamp), message.body] = messages.to_ground_truth(
             message
         )
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
+    def _on_controller(self, data: bytes) -> None:
+        message = deserialize_message(data, ControllerState)
+        self._tell_controller(
+            state=_STATES.get(message.state, "unknown"),
+            reason=message.reason,
+            target=_finite(message.target),
+            error=_finite(message.error),
+            cycles=message.cycles,
+        )
+
+    def _tell_controller(self, **news: Any) -> None:
+        unknown = {"body": "", "state": "idle", "reason": "", "target": None, "error": None, "cycles": None}
+        self._controller = {**(self._controller or {**unknown, "limits": {}}), **news}
+        self._feed.set_instrument({"controller": self._controller})
+
+    def _on_diagnostics(self, data: bytes) -> None:
+        for status in deserialize_message(data, DiagnosticArray).status:
             self._diagnostics[status.name] = {
                 "name": status.name,
                 "level": int.from_bytes(status.level, "little"),
@@ -196,6 +247,9 @@ class MonitorNode(InstrumentNode):
         elapsed, self._counted_at = now - self._counted_at, now
         rates = {name: self._counts[name] / elapsed for name in _RATES}
         self._counts.clear()
+        services = {name: client.service_is_ready() for name, client in self._triggers.items()}
+        services[GO] = services["controller/stop"]
+        self._look_for_controller(services[GO])
         self._feed.set_instrument(
             {
                 "rates": {name: round(rate, 1) for name, rate in rates.items()},
@@ -205,10 +259,22 @@ class MonitorNode(InstrumentNode):
                     body: [alignment.cycles[0], alignment.cycles[-1]]
                     for body, alignment in self._alignments.items()
                 },
-                "services": {name: client.service_is_ready() for name, client in self._triggers.items()},
+                "services": services,
                 "diagnostics": list(self._diagnostics.values()),
             }
         )
+
+    def _look_for_controller(self, here: bool) -> None:
+        """Ask one that has come within which limits it moves."""
+        known, self._controller_known = self._controller_known, here and self._limits.service_is_ready()
+        if known or not self._controller_known:
+            return
+
+        def on_limits(done: Any) -> None:
+            values = dict(zip(_LIMITS, map(parameter_value_to_python, done.result().values), strict=True))
+            self._tell_controller(body=values.pop("body"), limits=values)
+
+        self._limits.call_async(GetParameters.Request(names=list(_LIMITS))).add_done_callback(on_limits)
 
     # Pictures -----------------------------------------------------------------------------------
 
@@ -263,10 +329,17 @@ class MonitorNode(InstrumentNode):
 
     def _call(self, service: str, value: float | None) -> Future[tuple[bool, str]]:
         """Call a service from the server's thread."""
-        client = self._triggers[service]
         answer: Future[tuple[bool, str]] = Future()
+        client = self._triggers["controller/stop" if service == GO else service]
         if not client.service_is_ready():
             answer.set_result((False, "nobody offers this service now"))
+            return answer
+        if (value is None) is (service == GO):
+            answer.set_result((False, "a target needs an angle, everything else none"))
+            return answer
+        if service == GO:
+            self._targets.publish(Float64(data=value))
+            answer.set_result((True, f"target {value:.6g} rad sent"))
             return answer
         pending = client.call_async(Trigger.Request())
 
@@ -278,6 +351,11 @@ class MonitorNode(InstrumentNode):
         pending.add_done_callback(on_response)
         answer.add_done_callback(lambda _: client.remove_pending_request(pending))
         return answer
+
+
+def _finite(value: float) -> float | None:
+    """JSON knows no NaN."""
+    return value if math.isfinite(value) else None
 
 
 def main(args: list[str] | None = None) -> int:

@@ -50,10 +50,10 @@ class Instrument:
         says: str = "live page: ",
     ) -> None:
         self._resources = contextlib.ExitStack()
-        domain = self._resources.enter_context(own_domain())
+        self.domain = self._resources.enter_context(own_domain())
         self._environment = os.environ | {
             "PYTHONPATH": str(ROOT),
-            "ROS_DOMAIN_ID": str(domain),
+            "ROS_DOMAIN_ID": str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUNBUFFERED": "1",

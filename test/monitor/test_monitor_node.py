@@ -10,9 +10,20 @@ from urllib.parse import urlsplit
 import aiohttp
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseStamped
 from monitor_helpers import Instrument
+from peers import Peer
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
 
+from mems6dof_msgs.msg import ControllerState
 from mems6dof_ros.monitor.history import COLUMNS
+from mems6dof_ros.monitor.synthetic import Machine
+from mems6dof_ros.nodes.actuation import ANSWERS
+from mems6dof_ros.nodes.localizer import point_cloud
 
 COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 
@@ -41,6 +52,7 @@ class Page:
                     else:
                         body = message.data[16:]
                         self.pictures.append((json.loads(body[:a]), body[a:]))
+                        await self.socket.send_json({"type": "seen"})
                 else:
                     told = json.loads(message.data)
                     if told["type"] == "state":
@@ -49,6 +61,20 @@ class Page:
                         self.results.append(told)
 
         await asyncio.wait_for(take(), timeout)
+
+
+@pytest.fixture
+def start():
+    """Starts monitors without anything to watch, with their arguments."""
+    running: list[Instrument] = []
+
+    def start_one(*arguments: str) -> Instrument:
+        running.append(Instrument(*arguments, machine_args=None))
+        return running[-1]
+
+    yield start_one
+    for watched in running:
+        watched.stop()
 
 
 def with_page(instrument: Instrument, act) -> None:
@@ -115,6 +141,107 @@ def test_services_are_called(instrument):
         await page.until(lambda: len(page.rows) > count + 20)
 
     with_page(instrument, act)
+
+
+def test_a_controller_is_shown_and_steered(start):
+    watched = start("-p", "port:=0")
+    peer = Peer(watched.domain)
+    limits = {
+        "max_play": 3e-6,
+        "max_tilt": 5e-3,
+        "max_sd_psi": 5e-4,
+        "max_pose_age": 1.0,
+        "move_timeout": 60.0,
+    }
+
+    def tell(request, response):
+        for name in request.names:
+            response.values.append(
+                ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=limits[name])
+                if name in limits
+                else ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="load_gear")
+            )
+        return response
+
+    def stop(_, response):
+        response.success, response.message = True, "stopped"
+        return response
+
+    async def act(page: Page) -> None:
+        await page.until(lambda: "services" in page.state)
+        assert "controller" not in page.state
+        stopping = peer.node.create_service(Trigger, "controller/stop", stop)
+        peer.node.create_service(GetParameters, "controller/get_parameters", tell)
+        peer.listen(Float64, "psi_target")
+        states = peer.node.create_publisher(ControllerState, "controller_state", ANSWERS)
+        await page.until(lambda: page.state.get("controller", {}).get("limits"))
+        assert page.state["controller"]["limits"] == limits
+        assert page.state["controller"]["body"] == "load_gear"
+        assert page.state["services"]["controller/go"] is True
+        for number, (service, value) in enumerate(
+            (("go", 0.25), ("stop", None), ("go", None), ("stop", 1.0))
+        ):
+            with_value = {} if value is None else {"value": value}
+            request = {"type": "call", "id": number, "service": f"controller/{service}", **with_value}
+            await page.socket.send_json(request)
+            await page.until(lambda number=number: len(page.results) > number)
+        assert [result["success"] for result in page.results] == [True, True, False, False]
+        peer.wait(lambda: peer.received["psi_target"])
+        assert [message.data for message in peer.received["psi_target"]] == [0.25]
+        states.publish(
+            ControllerState(state=3, reason="pose lost", target=0.25, error=float("nan"), cycles=7)
+        )
+        await page.until(lambda: page.state["controller"]["state"] == "stopped")
+        shown = page.state["controller"]
+        assert (shown["reason"], shown["target"], shown["error"], shown["cycles"]) == (
+            "pose lost",
+            0.25,
+            None,
+            7,
+        )
+        peer.node.destroy_service(stopping)
+        await page.until(lambda: page.state["services"]["controller/go"] is False)
+
+    try:
+        with_page(watched, act)
+    finally:
+        peer.close()
+
+
+def test_enlarged_copies_are_published_where_asked_for_and_only_there(start):
+    plain, enlarging = start("-p", "port:=0"), start("-p", "port:=0", "-p", "viz_scale:=1000.0")
+    assert plain.url
+    assert enlarging.url
+    peers = Peer(plain.domain), Peer(enlarging.domain)
+    try:
+        found = Machine(seed=2, size=256).cycle(0, image=False)[1]
+        cloud, pose = point_cloud(found), PoseStamped()
+        pose.header.frame_id = "microscope"
+        pose.pose.position.x, pose.pose.orientation.w = 2e-6, 1.0
+        peer = peers[1]
+        peer.listen(PoseStamped, "viz/pose")
+        peer.listen(PointCloud2, "viz/points")
+        poses, clouds = (
+            peer.publisher(PoseStamped, "pose"),
+            peer.publisher(PointCloud2, "localizations/points"),
+        )
+        poses.publish(pose)
+        clouds.publish(cloud)
+        peer.wait(lambda: peer.received["viz/pose"] and peer.received["viz/points"])
+        enlarged, points = peer.received["viz/pose"][0], peer.received["viz/points"][0]
+        assert enlarged.header.frame_id == points.header.frame_id == "microscope_enlarged"
+        assert enlarged.pose.position.x == pytest.approx(2e-3)
+        assert enlarged.pose.orientation.w == 1.0
+        kinds = [("xyz", "<f4", 3), ("flux", "<f4"), ("flags", "<u4")]
+        before, after = (np.frombuffer(c.data, dtype=kinds) for c in (cloud, points))
+        np.testing.assert_allclose(after["xyz"], 1000 * found.position, rtol=1e-6)
+        np.testing.assert_array_equal(after["flux"], before["flux"])
+        np.testing.assert_array_equal(after["flags"], before["flags"])
+        names = {topic for topic, _ in peers[0].node.get_topic_names_and_types()}
+        assert not {topic for topic in names if "viz" in topic}
+    finally:
+        for peer in peers:
+            peer.close()
 
 
 def test_the_token_is_told_to_nobody_but_the_terminal(monkeypatch):

@@ -5,10 +5,15 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import shutil
 import socket
+import ssl
 import struct
+import subprocess
 import threading
 import time
+import tracemalloc
+from dataclasses import replace
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -16,10 +21,12 @@ import numpy as np
 import pytest
 
 from mems6dof_ros.errors import InputError
-from mems6dof_ros.monitor import access
+from mems6dof_ros.monitor import access, door, server
+from mems6dof_ros.monitor.attacks import ATTACKS
 from mems6dof_ros.monitor.history import COLUMNS
 from mems6dof_ros.monitor.picture import make_picture
 from mems6dof_ros.monitor.server import MAX_MESSAGE, MAX_MESSAGES_PER_SECOND, MAX_PAGES
+from mems6dof_ros.monitor.validation import attacked
 from mems6dof_ros.pose.cycle_pose import CyclePose
 
 CYCLE = list(COLUMNS).index("cycle")
@@ -69,6 +76,19 @@ def open_page(session: aiohttp.ClientSession, served, **headers: str):
     return session.ws_connect(
         origin(served) + "/live", headers={"Origin": origin(served), **headers}, max_msg_size=0
     )
+
+
+def upgrade(served) -> bytes:
+    """The opening handshake of a page, as bytes."""
+    lines = ("GET /live HTTP/1.1", f"Host: {urlsplit(served.url).netloc}", f"Origin: {origin(served)}",
+             "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
+             "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "", "")  # fmt: skip
+    return "\r\n".join(lines).encode()
+
+
+def text_frame(text: str) -> bytes:
+    """A short WebSocket frame of a client, masked by zero."""
+    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text.encode()
 
 
 def poses(machine, count: int) -> list[CyclePose]:
@@ -446,3 +466,146 @@ def test_stopping_says_goodbye(serve):
             return page.close_code
 
     assert asyncio.run(watch()) == 1001
+
+
+# How much it bears -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_attacks_are_refused_logged_and_disturb_nobody(name):
+    refused, logged, missed = attacked(ATTACKS[name])
+    assert refused
+    assert 1 <= logged <= 21
+    assert missed == 0
+
+
+def test_connections_that_never_become_a_page_are_closed(serve, monkeypatch):
+    monkeypatch.setattr(door, "PATIENCE", 0.3)
+    served = serve()
+    where = urlsplit(served.url)
+    with socket.create_connection((where.hostname, where.port)) as silent:
+        silent.settimeout(5)
+        assert silent.recv(1) == b""
+    wait_for(lambda: served.log)
+    assert "no page after" in served.log[0]
+    # One that was answered closes without a word, and a page stays.
+
+    async def stay():
+        async with aiohttp.ClientSession() as session, open_page(session, served) as page:
+            async with session.get(served.url) as response:
+                assert response.status == 200
+            await asyncio.sleep(0.6)
+            await page.send_json({"type": "pictures", "on": True})
+            await asyncio.sleep(0.2)
+            assert not page.closed
+            assert served.feed.watchers == 1
+
+    asyncio.run(stay())
+    assert len(served.log) == 1
+
+
+def test_a_page_that_takes_nothing_is_closed_and_costs_little_meanwhile(serve, machine, monkeypatch):
+    monkeypatch.setattr(server, "_SEND_TIMEOUT", 1.0)
+    served = serve()
+    frame, found, pose = machine.cycle(0)
+    picture = replace(make_picture(frame, found, [pose], {}), jpeg=bytes(500_000))
+    where = urlsplit(served.url)
+    with socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.connect((where.hostname, where.port))
+        deaf.sendall(upgrade(served))
+        deaf.sendall(text_frame('{"type": "pictures", "on": true}'))
+        wait_for(lambda: served.feed.watchers == 1)
+        tracemalloc.start()
+        for number in range(40):  # 20 MB of pictures, 1000 rows
+            served.feed.add_picture(picture)
+            for k in range(25):
+                served.feed.add_pose(replace(pose, cycle=25 * number + k))
+            time.sleep(0.02)
+        grown = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        assert grown < 4e6
+        wait_for(lambda: served.feed.watchers == 0)
+
+
+def test_a_slow_page_gets_the_newest_picture_and_every_row(serve, machine):
+    served = serve()
+    frame, found, pose = machine.cycle(0)
+    picture = make_picture(frame, found, [pose], {})
+    numbers, cycles = [], []
+    fed = 0
+
+    def feed():
+        nonlocal fed
+        for number in range(250):
+            overlay = {**picture.overlay, "frame_counter": number}
+            served.feed.add_picture(replace(picture, jpeg=bytes(100_000), overlay=overlay))
+            served.feed.add_pose(replace(pose, cycle=number))
+            fed = number
+            time.sleep(0.02)
+
+    async def dawdle():
+        async with aiohttp.ClientSession() as session, open_page(session, served) as page:
+            await page.send_json({"type": "pictures", "on": True})
+            feeding = threading.Thread(target=feed)
+            feeding.start()
+            while len(cycles) < 250:
+                message = await page.receive(5)
+                if message.type is not aiohttp.WSMsgType.BINARY:
+                    continue
+                if message.data[0] == 1:
+                    cycles.extend(rows_of(message.data)[:, CYCLE].astype(int).tolist())
+                else:
+                    size = struct.unpack_from("<4I", message.data)[1]
+                    numbers.append((json.loads(message.data[16 : 16 + size])["frame_counter"], fed))
+                    await asyncio.sleep(0.2)  # 5 pictures/s of the 25 that would be sent
+                    await page.send_json({"type": "seen"})
+            feeding.join()
+
+    asyncio.run(dawdle())
+    assert cycles == list(range(250))
+    assert len(numbers) < 60
+    assert max(now - number for number, now in numbers) < 25  # half a second
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="a certificate is made by openssl")
+def test_the_page_is_served_encrypted(serve, tmp_path):
+    certificate, key = tmp_path / "page.pem", tmp_path / "page.key"
+    command = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "2",
+        "-subj",
+        "/CN=localhost",
+    ]
+    subprocess.run(
+        [*command, "-addext", "subjectAltName=IP:127.0.0.1", "-out", certificate, "-keyout", key],
+        check=True,
+        capture_output=True,
+    )
+    served = serve(certificate=str(certificate), key=str(key), token=TOKEN)
+    assert served.url.startswith("https://127.0.0.1:")
+    trusted = ssl.create_default_context(cafile=str(certificate))
+
+    async def look():
+        jar = aiohttp.CookieJar(unsafe=True)  # which keeps cookies of an address, as browsers do
+        async with aiohttp.ClientSession(cookie_jar=jar) as session:
+            async with session.get(served.url, ssl=trusted) as response:
+                assert b"<html" in await response.read()
+                assert "Secure" in response.history[0].headers["Set-Cookie"]
+            origin_ = served.url.partition("/?")[0]
+            async with session.ws_connect(
+                f"{origin_}/live", headers={"Origin": origin_}, ssl=trusted, max_msg_size=0
+            ) as page:
+                assert json.loads((await page.receive(5)).data)["type"] == "hello"
+
+    asyncio.run(look())
+    for wrong in ({"certificate": str(certificate)}, {"certificate": "absent.pem", "key": str(key)},
+                  {"certificate": str(key), "key": str(certificate)}):  # fmt: skip
+        with pytest.raises(InputError, match="certificate"):
+            serve(**wrong)

@@ -80,7 +80,10 @@ const link = new Link({
     }
     showHistory();
   },
-  picture(overlay, jpeg) { if (!paused) micrograph.setPicture(overlay, jpeg); },
+  async picture(overlay, jpeg) {
+    if (!paused) await micrograph.setPicture(overlay, jpeg);
+    link.send({ type: "seen" });
+  },
 });
 
 // A page that nobody sees asks for no pictures, so that none are made.

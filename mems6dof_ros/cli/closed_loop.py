@@ -34,7 +34,11 @@ def run_closed_loop(
     angles = random_targets(targets, settings.seed)
     out.mkdir(parents=True, exist_ok=True)
     bag = str(out / "bag") if record else ""
-    with closed_loop(settings, calibration, out / "nodes.log", bag) as (client, _):
+
+    def on_page(url: str) -> None:
+        print(f"     watch it in a browser: {url}", file=sys.stderr, flush=True)
+
+    with closed_loop(settings, calibration, out / "nodes.log", bag, on_page) as (client, _):
         with Progress("closed loop: targets") as progress:
             closed = approach(client, settings, angles, progress)
         path = _path(client)

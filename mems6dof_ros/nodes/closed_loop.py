@@ -34,10 +34,16 @@ def data_sheet(settings: SimulationSettings) -> DriveSettings:
 
 @contextlib.contextmanager
 def closed_loop(
-    settings: SimulationSettings, calibration: Path, log: Path, bag: str = "", **limits: Any
+    settings: SimulationSettings,
+    calibration: Path,
+    log: Path,
+    bag: str = "",
+    on_page: Callable[[str], None] | None = None,
+    **limits: Any,
 ) -> Iterator[tuple[LoopClient, RunningSystem]]:
     """The nodes, ready, with a client; ``log`` gets what they print, ``bag`` what they publish but for the
-    images. ``limits``: parameters of the controller. Raises Mems6dofError where a node fails by itself."""
+    images, ``on_page`` the address of a live page. ``limits``: parameters of the controller. Raises
+    Mems6dofError where a node fails by itself."""
     drive = data_sheet(settings)
     told = {f"drive.{name}": getattr(drive, name) for name in ("step", "scatter", "backlash")}
     nodes = chain(
@@ -46,6 +52,7 @@ def closed_loop(
         output=bag,
         controller=NodeSpec("controller", {**told, **PATIENT, **limits}),
         watched=WATCHED,
+        monitor=NodeSpec("monitor", {"port": 0}) if on_page else None,
     )
     systems: list[RunningSystem] = []
 
@@ -59,6 +66,8 @@ def closed_loop(
 
         def on_line(line: str) -> None:
             print(line, file=lines, flush=True)
+            if on_page and line.startswith("[monitor] live page:"):
+                on_page(line.rsplit(" ", 1)[-1])
 
         with loop_client(check) as client, run_system(nodes, on_line=on_line) as system:
             systems.append(system)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 import subprocess
-import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from peers import own_domain
 
 from mems6dof_ros.calibration.calibrate import calibrate
 from mems6dof_ros.calibration.file import save_calibration
@@ -37,12 +37,13 @@ SETTINGS = SimulationSettings(
 
 
 @pytest.fixture(autouse=True)
-def domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """A ROS domain of each test's own, on this machine only, for this process and its children."""
-    number = 1 + zlib.crc32(f"{os.getpid()} {request.node.name}".encode()) % 100
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with own_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +100,9 @@ def test_the_demonstration_writes_what_it_says(
 ) -> None:
     out = tmp_path / "out"
     assert run_closed_loop(out, calibration=calibration, settings=SETTINGS, targets=2) == 0
-    printed = capsys.readouterr().out
+    printed, told = capsys.readouterr()
     assert "open loop, same drive" in printed
+    assert "watch it in a browser: http://127.0.0.1:" in told
     assert (out / "closed_loop.png").stat().st_size > 10_000
     lines = [line for line in (out / "moves.csv").read_text().splitlines() if not line.startswith("#")]
     assert len(lines) == 3

@@ -37,7 +37,9 @@ from mems6dof_ros.localization.tracking import TrackingLocalizer, TrackingSettin
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
+from mems6dof_ros.nodes.frame_order import Arrival, FrameOrder
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.nodes.sim_time import on_jump_back
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
 
@@ -106,9 +108,7 @@ class LocalizationOutput:
         self._node = node
         self.localizer = make_localizer(node.values)
         self.tracker: TrackingLocalizer | None = None
-        if node.values["tracking.enabled"]:
-            settings = to_settings(TrackingSettings, "tracking.", node.values)
-            self.tracker = TrackingLocalizer(self.localizer, settings)
+        self.forget()
         self.publisher = node.create_publisher(LocalizationsMessage, topics.LOCALIZATIONS, transport.MESSAGES)
         self._points = node.create_publisher(PointCloud2, POINTS, transport.FRAMES)
         calibration = self.localizer.calibration
@@ -121,6 +121,12 @@ class LocalizationOutput:
     def localize(self, frame: Frame) -> Localizations:
         """As Localizer.localize."""
         return (self.tracker or self.localizer).localize(frame)
+
+    def forget(self) -> None:
+        """Forget where particles were: cycles are counted anew."""
+        if self._node.values["tracking.enabled"]:
+            settings = to_settings(TrackingSettings, "tracking.", self._node.values)
+            self.tracker = TrackingLocalizer(self.localizer, settings)
 
     def observe(self, pose: CyclePose) -> None:
         """Let the pose of a cycle tell where particles will be; from the thread that localizes."""
@@ -145,8 +151,11 @@ class LocalizerNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("localizer", PARAMETERS)
+        self._order = FrameOrder()
+        self._jumps = on_jump_back(self, self._on_jump_back)
 
     def configure(self) -> None:
+        self._order = FrameOrder()
         self._output = LocalizationOutput(self)
         self._last = -1, -1  # frame counter and cycle of the frame before
 
@@ -184,12 +193,16 @@ class LocalizerNode(InstrumentNode):
         self._matcher.tick()
         self._forward()
 
+    def _on_jump_back(self, seconds: float) -> None:
+        self.health.lost(0, f"time jumped back by {seconds:.3f} s: from the next earlier frame on all is new")
+        self._order.rewind()
+
     def _forward(self) -> None:
         """Hand on what is complete."""
         assert self.worker is not None
-        expected = self._matcher.informed or self.count_publishers(topics.FRAME_INFO) > 0
-        for arrived in self._matcher.take(expected):
-            if arrived.info is None and expected:
+        self._informed = self._matcher.informed or self.count_publishers(topics.FRAME_INFO) > 0
+        for arrived in self._matcher.take(self._informed):
+            if arrived.info is None and self._informed:
                 self.health.count("frames without frame_info")
             self.worker.put(arrived)
 
@@ -197,19 +210,29 @@ class LocalizerNode(InstrumentNode):
 
     def _localize(self, arrived: ArrivedFrame) -> None:
         begin_ns = time.time_ns()
-        counter, cycle, lost = self._account(arrived.info)
         try:
-            while self._poses:
-                self._output.observe(self._poses.popleft())
             frame = messages.to_frame(arrived.image, arrived.info)
-            found = self._output.localize(replace(frame, frame_counter=counter, cycle=cycle))
         except InputError as error:
             self.health.refused(str(error))
+            if self._informed and arrived.info is None:
+                return  # of whom nobody told that it is a frame
+            frame = None
+        if not self._take_in(arrived):
+            return
+        counter, cycle, lost = self._account(arrived.info)
+        while self._poses:
+            self._output.observe(self._poses.popleft())
+        found = None
+        if frame is not None:
+            try:
+                found = self._output.localize(replace(frame, frame_counter=counter, cycle=cycle))
+            except InputError as error:
+                self.health.refused(str(error))
+        if found is None:
             header = arrived.image.header
             published_ns = messages.nanoseconds(arrived.info.publication_time) if arrived.info else 0
-            found = nothing_found(
-                messages.nanoseconds(header.stamp), header.frame_id, counter, cycle, published_ns
-            )
+            stamp_ns = messages.nanoseconds(header.stamp)
+            found = nothing_found(stamp_ns, header.frame_id, counter, cycle, published_ns)
         published_ns = time.time_ns()
         found = replace(
             found,
@@ -219,6 +242,22 @@ class LocalizerNode(InstrumentNode):
         )
         self._output.publish(found)
         self.health.time("waiting in the queue", found.latency.queue)
+
+    def _take_in(self, arrived: ArrivedFrame) -> bool:
+        """False for a frame that comes again or late, of which there is, or will be, nothing to tell."""
+        stamp_ns, info = messages.nanoseconds(arrived.image.header.stamp), arrived.info
+        arrival = self._order.judge(stamp_ns, int(info.frame_counter) if info else None)
+        if arrival in (Arrival.AGAIN, Arrival.LATE):
+            self.health.refused(f"the frame of {stamp_ns} ns arrived {arrival.name.lower()}")
+            return False
+        if arrival is not Arrival.NEXT:
+            if arrival is Arrival.ANEW:
+                self.health.lost(0, f"the source has begun anew at {stamp_ns} ns")
+            self._output.forget()
+            self._poses.clear()
+            if info:
+                self._last = -1, -1
+        return True
 
     def _account(self, info: FrameInfo | None) -> tuple[int, int, int]:
         """Frame counter, motion cycle, and frames lost since the last frame."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.nodes.common import PARENT_VARIABLE
-from mems6dof_ros.nodes.system import NodeSpec, System, given
+from mems6dof_ros.nodes.system import NodeSpec, RunningSystem, System, given
 
 
 def description(system: System) -> Any:
@@ -45,4 +45,6 @@ def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
         additional_env={PARENT_VARIABLE: str(os.getpid())},
         # Of a finite system, the end of its source and the failure of any node are the end.
         on_exit=Shutdown() if finite else None,
+        respawn=spec.respawn,
+        respawn_delay=RunningSystem.RESPAWN_DELAY,
     )

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mcap.writer import MCAP0_MAGIC
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -315,10 +316,20 @@ class RecorderNode(InstrumentNode):
         if self._bytes > before:
             self.health.set("disk, min until it is full", round(free / (self._bytes - before) / 60.0))
 
+    def _next_path(self) -> str:
+        """Where to record: ``output``, or beside it where this node has recorded there, or one was killed."""
+        output = self.values["output"]
+        if not output:
+            return f"recording_{datetime.datetime.now():%Y%m%d_%H%M%S}"
+        path = f"{output}_{self._bags}" if self._bags else output
+        while _interrupted(Path(path)):
+            self.get_logger().warning(f"{path} was interrupted: mems6dof recover {path}")
+            self._bags += 1
+            path = f"{output}_{self._bags}"
+        return path
+
     def _open(self) -> None:
-        path = self.values["output"] or f"recording_{datetime.datetime.now():%Y%m%d_%H%M%S}"
-        if self._bags and self.values["output"]:
-            path += f"_{self._bags}"
+        path = self._next_path()
         needed = self.values["minimum_free_mebibytes"] * _MEBIBYTE
         try:
             Path(path).mkdir(parents=True, exist_ok=True)
@@ -411,6 +422,16 @@ class RecorderNode(InstrumentNode):
 
 def _attach(bag: BagWriter, name: str, text: str) -> None:
     bag.attach(name, text.encode(), "application/yaml")
+
+
+def _interrupted(path: Path) -> bool:
+    """True for the bag of a recorder that could not complete it: a file without the magic at its end."""
+    for file in path.glob("*.mcap"):
+        with file.open("rb") as stream:
+            stream.seek(max(file.stat().st_size - len(MCAP0_MAGIC), 0))
+            if stream.read() != MCAP0_MAGIC:
+                return True
+    return False
 
 
 def main(args: list[str] | None = None) -> int:

@@ -17,13 +17,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.errors import InputError, Mems6dofError
-from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes import shared_memory, transport
 from mems6dof_ros.nodes.common import PARENT_VARIABLE, WAIT_PARAMETER
 from mems6dof_ros.nodes.parameters import to_yaml
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
@@ -52,13 +53,15 @@ _SUBSCRIBED = {
 class NodeSpec:
     """One node of a system: ``executable`` of this package, with its parameters and remappings.
 
-    ``ends_system``: when this process ends, the others have nothing left to do.
+    ``ends_system``: when this process ends, the others have nothing left to do. ``respawn``: when it fails or
+    is killed, it is started again.
     """
 
     executable: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
     remappings: Mapping[str, str] = field(default_factory=dict)
     ends_system: bool = False
+    respawn: bool = False
 
 
 @dataclass(frozen=True)
@@ -200,7 +203,8 @@ def _live(values: Mapping[str, str]) -> list[NodeSpec]:
         parameters = {"source": values["source"], "pacing": "rate", "rate": float(values["rate"])}
         source = NodeSpec("frame_source", parameters)
     image_topic = values["image_topic"]
-    return chain(source, queue_policy="drop_oldest", image_topic=image_topic, **_common(values))
+    nodes = chain(source, queue_policy="drop_oldest", image_topic=image_topic, **_common(values))
+    return _respawning(nodes, values)
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -226,7 +230,7 @@ def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
         width_px=size, height_px=size, seed=int(values["seed"]), optics_seed=int(values["optics_seed"])
     )
     controller = NodeSpec("controller", {"law": values["law"]})
-    return chain(source, controller=controller, **_common(values))
+    return _respawning(chain(source, controller=controller, **_common(values)), values)
 
 
 def _calibrate(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -264,9 +268,18 @@ def _common(values: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
-    if values["monitor"] not in ("true", "false"):
-        raise InputError("argument monitor", f"'{values['monitor']}'", "true or false")
-    return NodeSpec("monitor") if values["monitor"] == "true" else None
+    return NodeSpec("monitor") if _truth(values, "monitor") else None
+
+
+def _respawning(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
+    respawn = _truth(values, "respawn")
+    return [replace(node, respawn=respawn) for node in nodes]
+
+
+def _truth(values: Mapping[str, str], name: str) -> bool:
+    if values[name] not in ("true", "false"):
+        raise InputError(f"argument {name}", f"'{values[name]}'", "true or false")
+    return values[name] == "true"
 
 
 _CALIBRATION = {
@@ -281,6 +294,7 @@ _ARRANGEMENT = {
     )
 }
 _MONITOR = {"monitor": ("false", "true: show it live to browsers on this machine, see docs/monitor.md")}
+_RESPAWN = {"respawn": ("false", "true: start a node again, after a second, that has failed or was killed")}
 _CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
 _NAMESPACE = {"namespace": ("", "Namespace of the nodes and their topics")}
 _SIMULATION = {
@@ -300,6 +314,7 @@ SYSTEMS = {
             **_OUTPUT,
             **_ARRANGEMENT,
             **_MONITOR,
+            **_RESPAWN,
             **_CONFIG,
             **_NAMESPACE,
         },
@@ -342,6 +357,7 @@ SYSTEMS = {
             **_OUTPUT,
             **_ARRANGEMENT,
             **_MONITOR,
+            **_RESPAWN,
             **_CONFIG,
             **_NAMESPACE,
         },
@@ -366,19 +382,51 @@ SYSTEMS = {
 
 
 class RunningSystem:
-    """The processes of a system, by executable."""
+    """The processes of a system, by executable, and how often each was ``respawned``."""
 
     #: Seconds that a process is given after SIGINT, enough for a recorder to write what waits for its disk,
     #: and after SIGTERM.
     GRACE = (60.0, 3.0)
+    #: Seconds until a process that failed or was killed is started again.
+    RESPAWN_DELAY = 1.0
 
-    def __init__(self, processes: Mapping[str, subprocess.Popen[str]]) -> None:
-        self.processes = processes
+    def __init__(self, start: Callable[[NodeSpec], subprocess.Popen[str]]) -> None:
+        self.processes: dict[str, subprocess.Popen[str]] = {}
+        self.respawned: Counter[str] = Counter()
+        self._start = start
+        self._kept: dict[str, NodeSpec] = {}
+        self._starting = threading.Lock()
+        self._stopping, self._stopped = threading.Event(), threading.Event()
+        self._keeper: threading.Thread | None = None
+
+    def add(self, node: NodeSpec) -> None:
+        """Start a node."""
+        self.processes[node.executable] = self._start(node)
+        if node.respawn:
+            self._kept[node.executable] = node
+            if self._keeper is None:
+                self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
+                self._keeper.start()
+
+    def _keep(self) -> None:
+        """Start again what has failed; ends last, because the kernel takes the thread that started a process
+        for its parent."""
+        while not self._stopping.wait(0.05):
+            for name, node in list(self._kept.items()):
+                if not self.processes[name].poll() or self._stopping.wait(self.RESPAWN_DELAY):
+                    continue
+                shared_memory.remove_abandoned()
+                with self._starting:
+                    if not self._stopping.is_set():
+                        self.processes[name] = self._start(node)
+                        self.respawned[name] += 1
+        self._stopped.wait()
 
     def poll(self) -> dict[str, int]:
-        """Exit codes of the processes that have ended."""
+        """Exit codes of the processes that have ended and are not started again."""
         codes = {name: process.poll() for name, process in self.processes.items()}
-        return {name: code for name, code in codes.items() if code is not None}
+        kept = set() if self._stopping.is_set() else set(self._kept)
+        return {name: code for name, code in codes.items() if code == 0 or (code and name not in kept)}
 
     def wait(self, *names: str, timeout: float | None = None) -> dict[str, int]:
         """Wait until one of ``names``, default all, has ended or any process has failed; returns ``poll()``.
@@ -399,6 +447,8 @@ class RunningSystem:
 
         SIGINT, then SIGTERM, then SIGKILL; returns all exit codes, negative ones by a signal.
         """
+        with self._starting:
+            self._stopping.set()
         for process in self.processes.values():
             for number, grace in zip((signal.SIGINT, signal.SIGTERM), self.GRACE, strict=True):
                 if process.poll() is None:
@@ -408,6 +458,7 @@ class RunningSystem:
             if process.poll() is None:
                 process.kill()
                 process.wait()
+        self._stopped.set()
         return self.poll()
 
 
@@ -425,27 +476,32 @@ def run_system(
     ``config``: directory of parameter files; ``environment``: for variables that ours does not set, by
     default discovery limited to this machine; ``on_line`` gets every line they print, with the node's name.
     """
-    processes: dict[str, subprocess.Popen[str]] = {}
     readers = []
+
+    def start(node: NodeSpec) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            command(node, namespace, config),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**_PLAIN_LINES, **environment, **os.environ, PARENT_VARIABLE: str(os.getpid())},
+            start_new_session=True,  # Ctrl-C reaches us alone, and we stop them in order
+        )
+        reader = threading.Thread(target=_forward, args=(node.executable, process, on_line), daemon=True)
+        reader.start()
+        readers.append(reader)
+        return process
+
+    shared_memory.remove_abandoned()
+    system = RunningSystem(start)
     try:
         for node in nodes:
-            process = subprocess.Popen(
-                command(node, namespace, config),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                env={**_PLAIN_LINES, **environment, **os.environ, PARENT_VARIABLE: str(os.getpid())},
-                start_new_session=True,  # Ctrl-C reaches us alone, and we stop them in order
-            )
-            processes[node.executable] = process
-            reader = threading.Thread(target=_forward, args=(node.executable, process, on_line), daemon=True)
-            reader.start()
-            readers.append(reader)
-        yield RunningSystem(processes)
+            system.add(node)
+        yield system
     finally:
-        RunningSystem(processes).stop()
+        system.stop()
         for reader in readers:
             reader.join(timeout=1.0)
 

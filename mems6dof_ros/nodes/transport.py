@@ -16,8 +16,9 @@ from pathlib import Path
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.nodes import shared_memory
 
-_SHARED_MEMORY = Path("/dev/shm")
+_SHARED_MEMORY = shared_memory.FOLDER
 _MEBIBYTE = 2**20
 #: Profile and what its segment with everything around it takes of /dev/shm, MiB.
 _MESSAGES = (Path(__file__).with_name("fastdds.xml"), 10)
@@ -58,11 +59,13 @@ def use_profile(*, frames: bool) -> str:
         return ""
     warning = ""
     profile, need = _FRAMES if frames else _MESSAGES
-    free = shutil.disk_usage(_SHARED_MEMORY).free // _MEBIBYTE if _SHARED_MEMORY.is_dir() else need
+    free = _free_shared_memory(need)
+    if free < need and shared_memory.remove_abandoned():
+        free = _free_shared_memory(need)
     if free < _MESSAGES[1]:
         raise Mems6dofError(
-            f"{_SHARED_MEMORY}: found {free} MiB free; expected {need} MiB or more: enlarge it, or"
-            f" remove {_SHARED_MEMORY}/fastrtps_* left by killed processes while no ROS 2 process runs"
+            f"{_SHARED_MEMORY}: found {free} MiB free; expected {need} MiB or more: enlarge it, or end"
+            " processes that fill it"
         )
     if free < need:
         warning = f"{_SHARED_MEMORY}: {free} of {need} MiB free: large frames will be slow or lost"
@@ -70,6 +73,13 @@ def use_profile(*, frames: bool) -> str:
     for name in _PROFILE_VARIABLES:
         os.environ[name] = str(profile)
     return warning
+
+
+def _free_shared_memory(otherwise: int) -> int:
+    """MiB; ``otherwise`` where the system has none."""
+    if not _SHARED_MEMORY.is_dir():
+        return otherwise
+    return shutil.disk_usage(_SHARED_MEMORY).free // _MEBIBYTE
 
 
 def stamp_of(data: bytes) -> int:

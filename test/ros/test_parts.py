@@ -315,12 +315,14 @@ def test_launch_files_start_the_same_table(name: str) -> None:
     system = SYSTEMS[name]
     assert [argument.arguments[0] for argument in arguments] == list(system.arguments)
     values = {argument.arguments[0]: argument.options["default_value"] for argument in arguments}
-    values |= {"output": "out", "namespace": "left", "config": "settings"}
+    given = {"output": "out", "namespace": "left", "config": "settings"}
+    values |= {name: value for name, value in given.items() if name in system.arguments}
     nodes = function.options["function"](SimpleNamespace(launch_configurations=values))
     table = system.table(values)
     assert [node.options["executable"] for node in nodes] == [spec.executable for spec in table]
     for node, spec in zip(nodes, table, strict=True):
         assert node.options["namespace"] == "left"
+        assert node.options["respawn"] is spec.respawn
         file, parameters = node.options["parameters"]
         assert file == f"settings/{spec.executable}.yaml"
         assert parameters.items() <= spec.parameters.items()

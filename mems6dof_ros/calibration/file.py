@@ -31,6 +31,7 @@ from mems6dof_ros.calibration.moments import residual_moments
 from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
 from mems6dof_ros.calibration.psf_estimator import PsfEstimator
 from mems6dof_ros.calibration.psf_model import PsfModel
+from mems6dof_ros.documents import read_document
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import WEIGHTINGS
@@ -220,15 +221,7 @@ def load_calibration(path: str | Path, method: str | None = None) -> Calibration
     content that does not match its own calibration_id.
     """
     where = str(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        found = error.strerror if isinstance(error, OSError) and error.strerror else "no text"
-        raise InputError(where, found, "a calibration file made by 'mems6dof calibrate'") from None
-    try:
-        document = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        raise InputError(where, f"no YAML ({str(error).splitlines()[0]})", "a calibration file") from None
+    document = read_document(path, "YAML", "a calibration file made by 'mems6dof calibrate'")
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(where, "no calibration", f"a file with 'format: {FORMAT}'")
     version = document.get("version")
@@ -243,7 +236,6 @@ def load_calibration(path: str | Path, method: str | None = None) -> Calibration
     return calibration.with_method(method) if method else calibration
 
 
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 _HEADER = """\
@@ -334,7 +326,7 @@ class _Fields:
         """Finite numbers of ``shape``; -1 stands for any length."""
         try:
             array = np.array(self(name), dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             array = np.empty(0)
         fits = array.ndim == len(shape) and all(
             want in (-1, got) for want, got in zip(shape, array.shape, strict=True)

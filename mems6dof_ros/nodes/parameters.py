@@ -226,7 +226,11 @@ def declare(
         except InvalidParameterValueException:
             found = _given(node)[name].value
             raise InputError(f"parameter {name}", repr(found), parameter.constraint) from None
-        values[name] = value if value is not None else []
+        if value is None:
+            if not isinstance(parameter.default, (tuple, list)):
+                raise InputError(f"parameter {name}", "nothing", _TYPE_NAMES[parameter.type])
+            value = []
+        values[name] = value
         if reason := parameter.check(values[name]):
             found, expected = reason.removeprefix("found ").split("; expected ", 1)
             raise InputError(f"parameter {name}", found, expected)

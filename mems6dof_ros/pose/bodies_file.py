@@ -22,8 +22,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from mems6dof_ros.documents import read_document
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.pose.bodies import COMMON_SETTINGS, Bodies
 from mems6dof_ros.pose.constellation_file import ReferenceConstellation
@@ -40,12 +39,7 @@ def load_bodies(path: Path, settings: PoseSettings | None = None, field: FieldEr
 
     Raises InputError for anything but the form above, and for bodies that cannot be told apart.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(str(path), error.strerror or "an unreadable file", "a file of bodies") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(str(path), "no valid YAML", "a file of bodies") from error
+    content = read_document(path, "YAML", "a file of bodies")
     content = _mapping(content, str(path), ("settings", "bodies"))
     names = [item.name for item in fields(PoseSettings)]
     common = _settings(content.get("settings"), names, f"{path}: settings")
@@ -108,7 +102,7 @@ def _number(value: Any, where: str) -> float:
     """YAML 1.1 takes 170e-6, without a point, for text."""
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(where, repr(value), "a number") from None
 
 

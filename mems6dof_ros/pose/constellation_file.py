@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mems6dof_ros import __version__
+from mems6dof_ros.documents import read_document
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.pose.body_frame import BodyFrame
 
@@ -57,14 +58,7 @@ class ReferenceConstellation:
     @classmethod
     def load(cls, path: Path) -> ReferenceConstellation:
         """Read what ``save`` wrote. Raises InputError for anything else."""
-        try:
-            content = json.loads(path.read_text())
-        except OSError as error:
-            raise InputError(
-                str(path), error.strerror or "an unreadable file", "a constellation file"
-            ) from error
-        except ValueError as error:
-            raise InputError(str(path), "no valid JSON", "a constellation file") from error
+        content = read_document(path, "JSON", "a constellation file")
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise InputError(str(path), "another kind of file", f"format {FORMAT!r}")
         if content.get("format_version") != VERSION:
@@ -76,7 +70,7 @@ class ReferenceConstellation:
             position = np.array(content["position"], float).reshape(len(ids), 3)
             covariance = np.array(content["covariance"], float).reshape(len(ids), 3, 3)
             body = str(content["body"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(
                 str(path), f"incomplete content ({error})", "ids, position, covariance, body"
             ) from error

@@ -339,7 +339,8 @@ class BagReader:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._reader.close()
+        with suppress(AttributeError):  # rosbags forgets what metadata.yaml said, of whatever type it was
+            self._reader.close()
 
     @property
     def topics(self) -> dict[str, str]:

@@ -90,6 +90,16 @@ def mcap_files(path: Path) -> list[Path]:
     return [path] if path.suffix == ".mcap" else []
 
 
+def interrupted(path: Path) -> bool:
+    """Is there a bag that its writer could not complete: the last file lacks its end?"""
+    files = mcap_files(path)
+    if not files or files[-1].stat().st_size < 2 * len(MCAP0_MAGIC):
+        return bool(files)
+    with files[-1].open("rb") as stream:
+        stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+        return stream.read() != MCAP0_MAGIC
+
+
 def recover(path: Path) -> list[Recovered]:
     """Complete an .mcap file, or all those of a bag, whose ``metadata.yaml`` is then written anew.
 

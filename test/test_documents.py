@@ -1,0 +1,45 @@
+"""Text files of plain values: one clear error for whatever is wrong."""
+
+from __future__ import annotations
+
+import pytest
+
+from mems6dof_ros.documents import read_document
+from mems6dof_ros.errors import InputError
+
+BOMB = "\n".join(
+    ["a0: &a0 [1, 1, 1, 1]", *(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}]" for k in range(1, 40))]
+)
+
+
+@pytest.mark.parametrize(
+    ("language", "content", "reason"),
+    [
+        ("YAML", b"a: [1, 2", "no valid YAML"),
+        ("YAML", b"a: 2001-99-99", "no valid YAML"),
+        ("YAML", b"\xff\xfe\x00", "no text"),
+        ("YAML", b"[" * 20_000, "nested too deeply|no valid YAML"),
+        ("YAML", BOMB.encode(), "references that multiply"),
+        ("JSON", b"{", "no valid JSON"),
+        ("JSON", b"[" * 200_000, "nested too deeply"),
+        ("JSON", b"9" * 100_000, "no valid JSON"),
+    ],
+)
+def test_what_is_no_document_is_refused(tmp_path, language, content, reason):
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=reason) as refused:
+        read_document(path, language, "a good file")
+    assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match="No such file"):
+        read_document(tmp_path / "absent", language, "a good file")
+
+
+def test_documents_are_read(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("a: &a [1, 2]\nb: *a\n")
+    assert read_document(path, "YAML", "") == {"a": [1, 2], "b": [1, 2]}
+    path.write_text("")
+    assert read_document(path, "YAML", "") is None
+    path.write_text('{"x": [1.5, NaN]}')
+    assert read_document(path, "JSON", "")["x"][0] == 1.5

@@ -54,12 +54,10 @@ def fit_gaussians(
     if not 0 < kappa < 10:
         raise InputError("kappa", f"{kappa}", "a positive number, about 0.1")
     n = len(positions)
-    starts = np.full((n, 7), np.nan)
-    starts[:, :2] = positions
     parameters, covariance, quality = np.empty((n, 7)), np.empty((n, 7, 7)), np.empty((n, 4))
     kernels.fit_windows(
         kernels.pixels(image),
-        starts,
+        positions,
         *camera.maps,
         float(camera.saturation_adu),
         window_px,

@@ -6,7 +6,7 @@ All kernels release the GIL (threads over frames) and are cached on disk. Argume
 name           shape, type         content
 =============  ==================  =====================================================================
 image          (h, w) u1 or u2     pixels, ADU
-starts         (n, 7)              x, y, A, sigma_x, sigma_y, rho, B as in parameters; A NaN: only x, y known
+starts         (n, 2)              positions: column and row, px
 offset         (h, w) or (1, 1)    ADU
 gain           (h, w) or (1, 1)    ADU per electron
 read_variance  (h, w) or (1, 1)    electrons^2
@@ -701,7 +701,6 @@ def _fit(
     read_variance: Array,
     weighting: int,
     kappa: float,
-    known: bool,
     theta: Array,
     side: int,
     field: Array,
@@ -709,12 +708,12 @@ def _fit(
     algebra: Array,
     quality: Array,
 ) -> tuple[int, int, float]:
-    """Fit the particle near a pixel. ``theta``: start where ``known``; the solution, relative to the pixel
-    that is returned; with the number of pixels that count, negative where the fit fails."""
+    """Fit the particle near a pixel. ``theta``: out, the solution, relative to the pixel that is returned
+    with the number of pixels that count, negative where the fit fails."""
     height, width = image.shape
     cut, largest = _read_window(image, column, row, offset, gain, read_variance, side, field, columns)
     count = _cover(side, field, columns)
-    if not known and not _start(side, columns.shape[1], field, theta):
+    if not _start(side, columns.shape[1], field, theta):
         return column, row, -1.0
     # First a rough uniform fit: a robust start for every weighting, the place of the window, and the
     # light that scales the relative weights. Then the fit itself.
@@ -773,8 +772,7 @@ def fit_windows(
     """Fit one Gaussian to the window about each start; NaN parameters where a fit fails.
 
     The window follows the particle, to a fraction of a pixel: neither where the detection put it nor
-    where the particle lies between pixels moves the result, nor does a start with a shape; where it leads
-    nowhere, the fit begins again without.
+    where the particle lies between pixels moves the result.
     """
     height, width = image.shape
     field, columns = _make_field(window, read_variance[0, 0]), _make_columns(window)
@@ -786,32 +784,22 @@ def fit_windows(
         start = starts[n]
         if not (-0.5 <= start[0] < width - 0.5 and -0.5 <= start[1] < height - 0.5):
             continue
-        known = not math.isnan(start[2])
-        pixels = -1.0
-        while True:
-            column, row = round(start[0]), round(start[1])
-            if known:
-                _to_theta(start, column, row, theta)
-            column, row, pixels = _fit(
-                image,
-                column,
-                row,
-                offset,
-                gain,
-                read_variance,
-                weighting,
-                kappa,
-                known,
-                theta,
-                window,
-                field,
-                columns,
-                algebra,
-                quality[n],
-            )
-            if pixels >= 0 or not known:
-                break
-            known = False
+        column, row, pixels = _fit(
+            image,
+            round(start[0]),
+            round(start[1]),
+            offset,
+            gain,
+            read_variance,
+            weighting,
+            kappa,
+            theta,
+            window,
+            field,
+            columns,
+            algebra,
+            quality[n],
+        )
         if pixels < 0:
             continue
         chi_square = _uncertainty(theta, pixels, window, field, columns, algebra, covariance[n])

@@ -13,10 +13,13 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import extending, types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
+
+#: As numba's, which tells type checkers of one argument too many.
+intrinsic: Any = extending.intrinsic
 
 LANES = 8
 _FLAGS = ("contract", "arcp", "nsz", "reassoc")

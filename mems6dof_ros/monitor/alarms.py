@@ -78,8 +78,8 @@ class Alarms:
             outside = not limit.low <= value <= limit.high
             if outside:
                 limit.count += 1
-                limit.outside_at = row[_COLUMN["stamp"]]
-            active = outside or row[_COLUMN["stamp"]] - limit.outside_at < HOLD
+                limit.outside_at = float(row[_COLUMN["stamp"]])
+            active = bool(outside or row[_COLUMN["stamp"]] - limit.outside_at < HOLD)
             if active != limit.active:
                 limit.active = active
                 changed.append((limit, value))

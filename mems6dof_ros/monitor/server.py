@@ -215,13 +215,9 @@ class MonitorServer:
         )
         self._pages.add(page_socket)
 
-        def too_slow() -> None:
-            self._log_refusal(request, f"takes nothing for {_SEND_TIMEOUT:.0f} s")
-            if request.transport is not None:
-                request.transport.abort()  # it would not take a goodbye either
-
-        page = _Page(self._feed, page_socket, self._call, too_slow)
+        page = _Page(self._feed, page_socket, self._call)
         sender = asyncio.create_task(page.send())
+        sender.add_done_callback(lambda sender: self._sent(request, sender))
         try:
             await page.receive()
         except _Refused as refusal:
@@ -231,9 +227,20 @@ class MonitorServer:
             self._pages.discard(page_socket)
             page.leave()
             sender.cancel()
-            with suppress(asyncio.CancelledError, ConnectionError, asyncio.TimeoutError):
+            with suppress(asyncio.CancelledError, Exception):  # told by _sent
                 await sender
         return page_socket
+
+    def _sent(self, request: web.Request, sender: asyncio.Task[None]) -> None:
+        """Cut off a page that will be sent nothing more: it must not stand still as if nothing happened."""
+        if sender.cancelled() or (error := sender.exception()) is None:
+            return
+        if isinstance(error, asyncio.TimeoutError):
+            self._log_refusal(request, f"takes nothing for {_SEND_TIMEOUT:.0f} s")
+        elif not isinstance(error, ConnectionError):
+            self._log(f"a page is cut off by {error!r}")
+        if request.transport is not None:
+            request.transport.abort()  # it would not take a goodbye either
 
     def _log_refusal(self, request: web.Request, reason: str) -> None:
         # Never the query: it may hold a token.
@@ -254,13 +261,10 @@ class MonitorServer:
 class _Page:
     """One open page: what it has been sent, and what it asks for."""
 
-    def __init__(
-        self, feed: Feed, socket: web.WebSocketResponse, call: Caller, too_slow: Callable[[], None]
-    ) -> None:
+    def __init__(self, feed: Feed, socket: web.WebSocketResponse, call: Caller) -> None:
         self._feed = feed
         self._socket = socket
         self._call = call
-        self._too_slow = too_slow
         self._wants_pictures = False
         self._unseen = False  # a picture is on its way
         self._received: deque[float] = deque(maxlen=MAX_MESSAGES_PER_SECOND)
@@ -306,12 +310,8 @@ class _Page:
         await self._send(self._socket.send_str(json.dumps(message, allow_nan=False)))
 
     async def _send(self, sending: Awaitable[None]) -> None:
-        """A page that takes nothing for long is closed; its rows would be lost to it anyway."""
-        try:
-            await asyncio.wait_for(sending, _SEND_TIMEOUT)
-        except asyncio.TimeoutError:
-            self._too_slow()
-            raise
+        """Raises TimeoutError where the page takes nothing for long; its rows would be lost to it anyway."""
+        await asyncio.wait_for(sending, _SEND_TIMEOUT)
 
     # From the page ------------------------------------------------------------------------------
 

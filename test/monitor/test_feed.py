@@ -75,6 +75,7 @@ def test_alarm_begins_and_ends_once_and_counts_every_cycle_outside():
     # Ended two seconds after the last value outside, the sixth.
     assert changes == [[], [], [1.1e-3], [], [], [], [], [], [0.1e-3], []]
     assert alarms.limits["tilt_x"].count == 2
+    json.dumps(alarms.limits["tilt_x"].active)  # which no number of numpy is
     alarms.remove("tilt_x")
     assert alarms.judge(row(tilt_x=1.0)) == []
 

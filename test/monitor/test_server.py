@@ -468,6 +468,21 @@ def test_stopping_says_goodbye(serve):
     assert asyncio.run(watch()) == 1001
 
 
+def test_a_page_that_cannot_be_sent_anything_is_cut_off_and_the_defect_told(serve):
+    served = serve()
+
+    async def watch():
+        async with aiohttp.ClientSession() as session, open_page(session, served) as page:
+            await page.receive(5)
+            served.feed.set_instrument({"rates": float("nan")})  # no JSON
+            while (await page.receive(5)).type in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY):
+                pass
+
+    asyncio.run(watch())
+    wait_for(lambda: served.log)
+    assert "cut off by ValueError" in served.log[0]
+
+
 # How much it bears -----------------------------------------------------------------------------------
 
 

@@ -55,10 +55,8 @@ const link = new Link({
       showLimits(state.limits, (quantity) => link.send({ type: "remove_limit", quantity }));
       fresh = true;
     }
-    if (changed("controller") || changed("services")) {
-      showController(state.controller, state.services);
-      showTarget();
-    }
+    if (changed("controller") || changed("services")) showController(state.controller, state.services);
+    if (changed("controller") || changed("bodies")) showTarget();
     if (changed("diagnostics")) showDiagnostics(state.diagnostics ?? []);
     if (changed("services")) {
       for (const button of serviceButtons) button.disabled = !state.services?.[button.dataset.service];

@@ -42,14 +42,15 @@ export function showStatus(open, state, body) {
   $("status").dataset.level = level;
   text($("status-name"), name);
   text($("status-reason"), reason);
+  $("status").title = reason;
   document.title = `${name} – mems6dof`;
 }
 
 // What the instrument lacks, where there is no pose.
 function missing(rates) {
-  if (rates?.localizations) return "particles are found, but no poses come: is pose_estimator running?";
-  if (rates?.frame_info) return "frames come, but nothing is found on them: is localizer running?";
-  return "nothing is heard: is the instrument running, in this ROS domain and namespace?";
+  if (rates?.localizations) return "no poses come: is pose_estimator running?";
+  if (rates?.frame_info) return "frames come, but no localizations: is localizer running?";
+  return "nothing is heard; same ROS domain and namespace?";
 }
 
 export function showFigures(history, state) {

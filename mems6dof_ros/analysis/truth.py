@@ -138,7 +138,8 @@ def _fit_constants(
             turned = microscope.rotation @ truth.rotation
             jacobian[:3, at : at + 3] = jacobian[3:, at + 3 : at + 6] = turned
             if fit_microscope:
-                jacobian[:, :6] = lever_jacobian(microscope.rotation @ truth.translation)
+                place = truth.rotation @ bodies[pose.reference_version].translation + truth.translation
+                jacobian[:, :6] = lever_jacobian(microscope.rotation @ place)
             weighted = weight @ jacobian
             normal += jacobian.T @ weighted
             right += weighted.T @ _pose_error(pose, truth, microscope, bodies[pose.reference_version])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mems6dof_ros.monitor.alarms import Alarms, Limit
-from mems6dof_ros.monitor.history import History, pose_row
+from mems6dof_ros.monitor.history import COLUMNS, History, pose_row
 from mems6dof_ros.monitor.picture import Picture
 from mems6dof_ros.pose.cycle_pose import CyclePose, Status
 
@@ -174,9 +174,10 @@ class Feed:
         )
 
     def _tell_alarm(self, limit: Limit, value: float, cycle: int) -> None:
-        text = f"{limit.quantity} = {value:.4g} in cycle {cycle}"
+        unit = COLUMNS[limit.quantity]
+        text = f"{limit.quantity} = {value:.4g} {unit} in cycle {cycle}".replace("  ", " ")
         if limit.active:
-            text += f", outside {limit.low:.4g} to {limit.high:.4g}"
+            text += f", outside {limit.low:.4g} to {limit.high:.4g} {unit}".rstrip()
             self._log(text)
             self.tell("alarm", text)
         else:

@@ -38,6 +38,7 @@ export class Micrograph {
     this.overlay = overlay;
     const grey = overlay.grey ? `, grey ${overlay.grey.map((g) => Math.round(g)).join(" to ")} ADU` : ", no image received";
     this.caption.textContent = `cycle ${overlay.cycle}${grey}`;
+    this.caption.title = this.caption.textContent;
     this.draw();
     this.point();
   }

@@ -107,7 +107,7 @@ export function showTiming(history, start, stop, state) {
 
 export function setUpLimits(limitable, send) {
   const select = $("limit-quantity"), low = $("limit-low"), high = $("limit-high");
-  select.replaceChildren(...limitable.map((key) => new Option(QUANTITIES[key].name, key)));
+  select.replaceChildren(...limitable.map((key) => new Option(`${QUANTITIES[key].label}: ${QUANTITIES[key].name}`, key)));
   const unit = () => text($("limit-unit"), QUANTITIES[select.value].unit);
   select.onchange = unit;
   unit();
@@ -145,7 +145,7 @@ export function showLimits(limits, remove) {
       const button = element("button", "", "×");
       button.title = "Remove this limit";
       button.onclick = () => remove(quantity);
-      return row("idle", element("span", "", QUANTITIES[quantity].name), element("span"), element("span", "muted"), button);
+      return row("idle", element("span", "label", QUANTITIES[quantity].label), element("span"), element("span", "muted"), button);
     }));
     if (!limits.length) root.append(element("div", "muted", "No limits set."));
   }

@@ -66,3 +66,22 @@ class FrameOrder:
         if (counter == 0 and last_counter > 0) or self._behind[1] == _A_NEW_RUN:
             return Arrival.ANEW
         return Arrival.AGAIN if stamp_ns in self._recent else Arrival.LATE
+
+
+class CycleCount:
+    """Motion cycles that ascend, also over a restart of the source that counts them."""
+
+    def __init__(self) -> None:
+        self._ahead, self._next = 0, 0
+        self._restarted = False
+
+    def restart(self) -> None:
+        """The source counts anew from the next cycle on."""
+        self._restarted = True
+
+    def __call__(self, cycle: int) -> int:
+        """The number of a cycle that the source calls ``cycle``."""
+        if self._restarted:
+            self._ahead, self._restarted = self._next - cycle, False
+        self._next = max(self._next, cycle + self._ahead + 1)
+        return cycle + self._ahead

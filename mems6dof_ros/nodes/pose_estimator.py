@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from std_srvs.srv import Trigger
 
 from mems6dof_msgs.msg import Localizations as LocalizationsMessage
@@ -28,7 +29,9 @@ from mems6dof_ros.frame import NAN
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
+from mems6dof_ros.nodes.frame_order import Arrival, CycleCount, FrameOrder
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.nodes.sim_time import on_jump_back
 from mems6dof_ros.pose.bodies import Bodies
 from mems6dof_ros.pose.bodies_file import load_bodies
 from mems6dof_ros.pose.cycle_pose import CyclePose
@@ -100,6 +103,7 @@ class PoseOutput:
         self._using_bodies = threading.Lock()
         self._cycles, self._valid = 0, Counter[str]()
         self._last_counter: int | None = None
+        self._number, self._without_increment = CycleCount(), set[str]()
         names = [estimator.body for estimator in self._bodies.estimators]
         self.publishers = {
             topic: node.create_publisher(messages.rclpy_type(kind), topic, transport.MESSAGES)
@@ -120,7 +124,7 @@ class PoseOutput:
             by = f"by calibration {found.calibration_id or 'none'}"
             raise InputError("localizations", by, f"{self._calibration.calibration_id}, the parameter's")
         with self._using_bodies:
-            poses = self._bodies.update(found)
+            poses = self._bodies.update(replace(found, cycle=self._number(found.cycle)))
             self._cycles += 1
             self._valid.update(pose.body for pose in poses if pose.valid)
         published_ns = time.time_ns()
@@ -130,11 +134,31 @@ class PoseOutput:
             pose=(published_ns - arrival_ns) * 1e-9,
             total=(published_ns - found.frame_published_ns) * 1e-9 if found.frame_published_ns else NAN,
         )
-        poses = [replace(pose, latency=latency) for pose in poses]
+        poses = [replace(self._as_counted(pose, found.cycle), latency=latency) for pose in poses]
         for topic, message in pose_messages(poses):
             self.publishers[topic].publish(messages.to_rclpy(message))
+        with self._using_bodies:
+            self._bodies.learn()  # what takes milliseconds now and then, when the poses are out
         self._report(poses)
         return poses
+
+    def begin_anew(self, *, forget: bool) -> None:
+        """Frames and cycles are counted anew, of the same bodies or, ``forget``, of whatever there is."""
+        self._last_counter = None
+        self._number.restart()
+        if forget:
+            self._reset()
+        else:
+            self._without_increment = {estimator.body for estimator in self._bodies.estimators}
+
+    def _as_counted(self, pose: CyclePose, cycle: int) -> CyclePose:
+        """With the source's own ``cycle``; how many went by while it did not count, nobody knows."""
+        pose = replace(pose, cycle=cycle)
+        if not pose.valid or pose.body not in self._without_increment:
+            return pose
+        self._without_increment.discard(pose.body)
+        none, uncertain = np.full(6, NAN), np.full((6, 6), NAN)
+        return replace(pose, increment_cycles=0, increment=none, increment_covariance=uncertain)
 
     def _report(self, poses: list[CyclePose]) -> None:
         health, states = self._node.health, []
@@ -214,8 +238,11 @@ class PoseEstimatorNode(InstrumentNode):
 
     def __init__(self) -> None:
         super().__init__("pose_estimator", PARAMETERS)
+        self._order = FrameOrder()
+        self._jumps = on_jump_back(self, self._on_jump_back)
 
     def configure(self) -> None:
+        self._order = FrameOrder()
         self._output = PoseOutput(self)
 
     def activate(self) -> None:
@@ -241,9 +268,21 @@ class PoseEstimatorNode(InstrumentNode):
     def _estimate(self, arrived: tuple[LocalizationsMessage, int]) -> None:
         message, arrival_ns = arrived
         try:
-            self._output.estimate(messages.to_localizations(message), arrival_ns)
+            found = messages.to_localizations(message)
+            arrival = self._order.judge(found.stamp_ns, found.frame_counter)
+            if arrival in (Arrival.AGAIN, Arrival.LATE):
+                self.health.refused(f"localizations of {found.stamp_ns} ns arrived {arrival.name.lower()}")
+                return
+            if arrival is not Arrival.NEXT:
+                self._output.begin_anew(forget=arrival is Arrival.REWOUND)
+            self._output.estimate(found, arrival_ns)
         except InputError as error:
             self.health.refused(str(error))
+
+    def _on_jump_back(self, seconds: float) -> None:
+        then = "the next cycle before now founds a new reference"
+        self.health.lost(0, f"time jumped back by {seconds:.3f} s: {then}")
+        self._order.rewind()
 
 
 def rehearse(settings: PoseSettings) -> None:

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from mems6dof_ros.nodes.frame_order import Arrival, FrameOrder
+from mems6dof_ros.nodes.frame_order import Arrival, CycleCount, FrameOrder
 
 NEXT, AGAIN, LATE, ANEW, REWOUND = Arrival
 PERIOD = 11_000_000
@@ -77,3 +77,12 @@ def test_time_that_jumps_back_counts_from_the_first_frame_behind():
 def test_frames_without_stamps_are_all_new():
     order = FrameOrder()
     assert [order.judge(0, None) for _ in range(3)] == [NEXT] * 3
+
+
+def test_cycles_ascend_over_restarts():
+    count = CycleCount()
+    assert [count(k) for k in (5, 6, 8)] == [5, 6, 8]
+    count.restart()
+    assert [count(k) for k in (0, 1, 2)] == [9, 10, 11]
+    count.restart()
+    assert [count(k) for k in (7, 6, 9)] == [12, 11, 14]

@@ -125,7 +125,7 @@ def _latencies(name: str, series: Series, bare: Series | None, median: float, wo
 # Arrangements --------------------------------------------------------------------------------------
 
 
-def _source(material: Material, rate: float, acknowledged_by: str) -> Any:
+def frame_source(material: Material, rate: float, acknowledged_by: str) -> Any:
     from mems6dof_ros.nodes.system import NodeSpec
 
     pacing = (
@@ -145,7 +145,7 @@ def _duration(material: Material) -> float:
 def _bare(material: Material, rate: float) -> Series:
     from mems6dof_ros.nodes.system import run_system
 
-    source = _source(material, rate, topics.LOCALIZATIONS)
+    source = frame_source(material, rate, topics.LOCALIZATIONS)
     waiting = {**source.parameters, "wait_for_subscribers": [f"{topics.IMAGE}:1"]}
     namespace = f"bench_{os.getpid()}"
     nodes = [replace(source, parameters=waiting)]
@@ -183,7 +183,7 @@ def _chain(
     from mems6dof_ros.nodes.system import chain, run_system
 
     nodes = chain(
-        _source(material, rate, topics.POSE_6DOF),
+        frame_source(material, rate, topics.POSE_6DOF),
         calibration=str(material.calibration_path),
         output=str(output) if output else "",
         recorded=[*DEFAULT_TOPICS, topics.IMAGE] if images else DEFAULT_TOPICS,
@@ -280,7 +280,7 @@ def _measure(
         if time.monotonic() - sampled > 0.5:
             sampled = time.monotonic()
             for name, pid in processes.items():
-                memory[name].append(_memory(pid))
+                memory[name].append(resident_memory(pid))
         return len(received) - first >= cycles if cycles else time.monotonic() - begin >= duration
 
     wait(done, max(60.0 + duration, cycles / 2))
@@ -311,7 +311,7 @@ def _processor_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _memory(pid: int) -> float:
+def resident_memory(pid: int) -> float:
     """Resident memory, MiB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import importlib
 import tempfile
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, cast
 
 from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
 
@@ -28,6 +30,12 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--only", choices=tuple(PARTS), action="append", help="this part only; may be repeated"
     )
+    parser.add_argument(
+        "--soak",
+        type=float,
+        metavar="MINUTES",
+        help="instead, leave every node running at the highest rate that they sustain",
+    )
     parser.add_argument("--seed", type=int, default=1, help="of what is random (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="directory to keep (default: a temporary one)")
     add_json_option(parser)
@@ -37,12 +45,24 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure part by part and print each; 1 where a figure misses its requirement."""
     table = []
+    parts = ["soak"] if args.soak else args.only or list(PARTS)
     with tempfile.TemporaryDirectory(prefix="mems6dof_lab_") as temporary:
-        for part in args.only or PARTS:
+        for part in parts:
             work = (args.out or Path(temporary)) / part
             work.mkdir(parents=True, exist_ok=True)
-            measure = importlib.import_module(PARTS[part]).figures
-            rows = list(measure(work, args.seed, lambda text: print(f"... {text}", flush=True)))
+            rows = list(_figures(part, work, args))
             print_table(rows)
             table += rows
-    return conclude(table, {"parts": list(args.only or PARTS), "seed": args.seed}, args.json)
+    return conclude(table, {"parts": parts, "seed": args.seed}, args.json)
+
+
+def _figures(part: str, work: Path, args: argparse.Namespace) -> Iterable[Mapping[str, Any]]:
+    def tell(text: str) -> None:
+        print(f"... {text}", flush=True)
+
+    if part == "soak":
+        from mems6dof_ros.bench.soak import soak
+
+        return soak(args.soak, work, tell)
+    figures = importlib.import_module(PARTS[part]).figures
+    return cast("Iterable[Mapping[str, Any]]", figures(work, args.seed, tell))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -32,7 +33,7 @@ class FieldModes:
     half_size: tuple[float, float]
     degree: int
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Name of each mode: component and degrees in x and y."""
         if self.degree < 1:
@@ -44,7 +45,7 @@ class FieldModes:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
+    @cached_property
     def degrees(self) -> NDArray[np.int64]:
         """Total degree of each mode, (m,)."""
         return np.array(

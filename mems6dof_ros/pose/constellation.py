@@ -15,11 +15,11 @@ from contextlib import suppress
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.blas import dsyrk
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from mems6dof_ros.pose.field import FieldError
-from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, rotation_z
+from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, lever_jacobian, rotation_z
 from mems6dof_ros.pose.solve import pose_jacobian
 
 Array = NDArray[np.float64]
@@ -74,7 +74,10 @@ class Constellation:
         self._origin = np.empty((0, 3))  # linearisation points
         self._information = np.zeros((len(modes), len(modes)))  # lower triangle; field first, then particles
         self._vector = np.zeros(len(modes))
+        self._eliminated: list[Array] = []  # of every cycle since: what its pose took, see observe
         self._refined_at = 0
+        #: Where in the field the body turns about, m.
+        self.pivot = np.zeros(3)
         self._latest = IDENTITY
         self._frames = np.zeros((2, 6, len(modes)))
 
@@ -109,6 +112,7 @@ class Constellation:
         n, old = len(ids), len(self._vector)
         if n == 0:
             return
+        self._settle()
         self.ids = np.r_[self.ids, ids]
         self.active = np.r_[self.active, np.ones(n, bool)]
         self.position = np.r_[self.position, position]
@@ -135,11 +139,11 @@ class Constellation:
         ``offset`` (n, 3) m: measured minus the place of ``linearisation(rows)``, field error not removed;
         ``weight`` (n, 3, 3) m^-2: inverse covariance of the localizations alone; ``modes`` (n, 3, k).
         """
-        order = np.argsort(rows)
-        moved = self._origin[rows[order]] @ pose.rotation.T
-        _accumulate(
-            self._information, self._vector, rows[order], pose.rotation, offset[order], weight[order], moved,
-            modes[order],
+        self._eliminated.append(
+            _accumulate(
+                self._information, self._vector, rows, pose.rotation, offset, weight,
+                self._origin[rows] @ pose.rotation.T, modes,
+            )
         )  # fmt: skip
         self.cycles += 1
         self._latest = pose
@@ -152,7 +156,8 @@ class Constellation:
         of the motion but a constant of the frames (see ``_constant_response``).
         """
         microscope, body = self._frames
-        constant = microscope + (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
+        constant = lever_jacobian(pose.translation) @ microscope
+        constant += (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
         return _field_response(
             rows, modes, self.coupling, pose.rotation, self.position, constant, self.field_factor
         )
@@ -198,6 +203,7 @@ class Constellation:
         Where covariances contradict each other beyond what numbers can hold, the map stays as it is.
         """
         self._refined_at = self.cycles
+        self._settle()
         self._forget_retired()
         with suppress(np.linalg.LinAlgError):
             self._solve()
@@ -207,11 +213,14 @@ class Constellation:
         information = self._information
         scale = np.r_[np.sqrt(np.diag(self.field.prior)), 1 / np.sqrt(np.diag(information)[k:])]
         vector = self._vector * scale
-        particles = information[k:, k:] * np.outer(scale[k:], scale[k:])
-        cross = information[k:, :k] * np.outer(scale[k:], scale[:k])
-        factor = cho_factor(particles, lower=True, overwrite_a=True, check_finite=False)
+        # The lower triangle in rows is the upper one in columns, which LAPACK wants.
+        particles = (information[k:, k:] * scale[k:, None] * scale[k:]).T
+        cross = information[k:, :k] * scale[k:, None] * scale[:k]
+        factor, failed = dpotrf(particles, clean=0, overwrite_a=1)
+        if failed:
+            raise np.linalg.LinAlgError("the map's information is not positive definite")
         # Positions given the field error; then what they leave to tell of it (Schur complement).
-        gain = cho_solve(factor, np.c_[cross, vector[k:]], check_finite=False)
+        gain, _ = dpotrs(factor, np.c_[cross, vector[k:]])
         evidence = information[:k, :k] * np.outer(scale[:k], scale[:k])
         evidence = np.tril(evidence) + np.tril(evidence, -1).T - cross.T @ gain[:, :k]
         pull = vector[:k] - cross.T @ gain[:, k]
@@ -221,11 +230,11 @@ class Constellation:
         correction = (gain[:, k] - gain[:, :k] @ (self.field_mean / scale[:k])) * scale[k:]
         self.coupling = -(gain[:, :k] * scale[k:, None] / scale[:k]).reshape(n, 3, k)
         self.position = self._origin + correction.reshape(n, 3)
-        inverse, _ = dpotri(factor[0], lower=1)
+        inverse, _ = dpotri(factor, overwrite_c=1)
         first = 3 * np.arange(n)
         for a in range(3):
             for b in range(a + 1):
-                block = inverse[first + a, first + b] * scale[k + first + a] * scale[k + first + b]
+                block = inverse[first + b, first + a] * scale[k + first + a] * scale[k + first + b]
                 self.covariance[:, a, b] = self.covariance[:, b, a] = block
         self._frames = self._constant_response()
 
@@ -237,19 +246,22 @@ class Constellation:
         an unknown constant is not an error of motion.
         """
         around, responses = [], []
+        scale = np.r_[np.ones(3), np.full(3, 1 / max(self.modes.half_size))]  # m per m, rad per m
         for angle in np.arange(AROUND) * (math.tau / AROUND):
-            pose = self._latest.then(RigidPose(rotation_z(angle), np.zeros(3)))
+            turn = rotation_z(angle)
+            pose = self._latest.then(RigidPose(turn, self.pivot - turn @ self.pivot))
             place = pose.apply(self.position)
             seen = np.flatnonzero((np.abs(place[:, :2]) < self.modes.half_size).all(axis=1))
             if len(seen) >= 8:
-                around.append(np.c_[np.eye(3), pose.rotation])
-                responses.append(self._response(pose, place, seen))
-        constants = np.zeros((2, 6, len(self.modes)))
-        for part in (slice(0, 3), slice(3, 6)) if around else ():
-            stacked = np.concatenate([response[part] for response in responses])
-            solution = np.linalg.lstsq(np.concatenate(around), stacked, rcond=1e-3)[0]
-            constants[0, part], constants[1, part] = solution[:3], solution[3:]
-        return constants
+                of_body = np.kron(np.eye(2), pose.rotation)
+                around.append(np.c_[lever_jacobian(pose.translation), of_body] / scale[:, None])
+                responses.append(self._response(pose, place, seen) / scale[:, None])
+        if not around:
+            return np.zeros((2, 6, len(self.modes)))
+        columns = np.r_[scale, scale]
+        design = np.concatenate(around) * columns
+        solution = np.linalg.lstsq(design, np.concatenate(responses), rcond=1e-3)[0]
+        return np.asarray((columns[:, None] * solution).reshape(2, 6, -1))
 
     def _response(self, pose: RigidPose, place: Array, seen: Indices) -> Array:
         """Change (6, k) of a pose with the coefficients of the field error, particles ``seen``."""
@@ -260,6 +272,15 @@ class Constellation:
         right = jacobian.T @ modes.reshape(len(jacobian), -1)
         solution = np.linalg.lstsq(normal * np.outer(scale, scale), scale[:, None] * right, rcond=1e-10)[0]
         return np.asarray(scale[:, None] * solution)
+
+    def _settle(self) -> None:
+        """Take off the information what the poses since took: one product for many cycles costs a tenth of
+        as many updates."""
+        if self._eliminated:
+            taken = np.concatenate(self._eliminated)
+            # In place: the lower triangle in rows is the upper one in columns.
+            dsyrk(-1.0, taken.T, beta=1.0, c=self._information.T, overwrite_c=1)
+            self._eliminated.clear()
 
     def _forget_retired(self) -> None:
         """Eliminate retired particles from the information matrix: what they told stays."""
@@ -344,8 +365,8 @@ class Candidates:
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _field_response(rows, modes, coupling, rotation, position, constant, factor):  # type: ignore[no-untyped-def]
     n, k = len(rows), modes.shape[2]
-    out, spread = np.zeros((n, 3, k)), np.empty((n, 3, 3))
-    line, moved = np.empty(k), np.empty(3)
+    lines, spread = np.empty((3 * n, k)), np.empty((n, 3, 3))
+    moved = np.empty(3)
     for i in range(n):
         p, g = position[rows[i]], coupling[rows[i]]
         for a in range(3):
@@ -356,107 +377,85 @@ def _field_response(rows, modes, coupling, rotation, position, constant, factor)
             by_one = moved[2] if a == 0 else (-moved[2] if a == 1 else moved[1])
             by_other = -moved[1] if a == 0 else (moved[0] if a == 1 else -moved[0])
             r0, r1, r2 = rotation[a, 0], rotation[a, 1], rotation[a, 2]
+            line = lines[3 * i + a]
             for m in range(k):
                 line[m] = (
                     modes[i, a, m] + r0 * g[0, m] + r1 * g[1, m] + r2 * g[2, m]
                     - constant[a, m] - by_one * constant[one, m] - by_other * constant[other, m]
                 )  # fmt: skip
-            for m in range(k):
-                for b in range(m + 1):
-                    out[i, a, b] += line[m] * factor[m, b]
+    out = np.dot(lines, factor).reshape(n, 3, k)
+    for i in range(n):
         for a in range(3):
-            for b in range(3):
+            for b in range(a + 1):
                 total = 0.0
                 for m in range(k):
                     total += out[i, a, m] * out[i, b, m]
-                spread[i, a, b] = total
+                spread[i, a, b] = spread[i, b, a] = total
     return out, spread
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _accumulate(information, vector, rows, rotation, offset, weight, moved, modes):  # type: ignore[no-untyped-def]
-    """Add one cycle to the normal equations, its pose eliminated; ``rows`` ascending, ``moved`` = R p.
+    """Add one cycle to the normal equations, its pose eliminated; ``moved`` = R p.
 
-    With W the weights, F the modes and J = [1, -hat(R p)], all turned into the body frame: the sum of
-    [F R]^T W [F R] less its projection on the pose, [F R]^T W J (J^T W J)^-1 J^T W [F R]. Rows of the result
-    are formed along contiguous memory, which the compiler vectorises.
+    With W the weights, F the modes and J = [1, -hat(R p)], all turned into the body frame, that is the sum of
+    [F R]^T W [F R] less its projection on the pose, E^T (J^T W J)^-1 E with E = J^T W [F R]. The projection
+    is returned as L^-1 E (6, size), where L L^T = J^T W J: its square is still to be taken off.
     """
     n, k = len(rows), modes.shape[2]
-    evidence = np.zeros((6, k + 3 * n))  # J^T W [F R]
+    evidence = np.zeros((6, len(vector)))
     normal, pull = np.zeros((6, 6)), np.zeros(6)
     jacobian, wj = np.zeros((3, 6)), np.zeros((3, 6))
     jacobian[0, 0] = jacobian[1, 1] = jacobian[2, 2] = 1.0
+    wf = np.empty((3 * n, k))
+    turned = np.empty((3, 3))
     for i in range(n):
         v, r = moved[i], offset[i]
         jacobian[0, 4], jacobian[0, 5] = v[2], -v[1]
         jacobian[1, 3], jacobian[1, 5] = -v[2], v[0]
         jacobian[2, 3], jacobian[2, 4] = v[1], -v[0]
-        for a in range(3):
-            for c in range(6):
-                wj[a, c] = (
-                    weight[i, a, 0] * jacobian[0, c] + weight[i, a, 1] * jacobian[1, c]
-                    + weight[i, a, 2] * jacobian[2, c]
-                )  # fmt: skip
-        for c in range(6):
-            w0, w1, w2 = wj[0, c], wj[1, c], wj[2, c]
-            pull[c] += w0 * r[0] + w1 * r[1] + w2 * r[2]
-            for b in range(6):
-                normal[c, b] += w0 * jacobian[0, b] + w1 * jacobian[1, b] + w2 * jacobian[2, b]
-            for m in range(k):
-                evidence[c, m] += w0 * modes[i, 0, m] + w1 * modes[i, 1, m] + w2 * modes[i, 2, m]
-            for a in range(3):
-                evidence[c, k + 3 * i + a] = w0 * rotation[0, a] + w1 * rotation[1, a] + w2 * rotation[2, a]
-    gain = np.linalg.solve(normal, evidence)
-    line = np.empty(k + 3 * n)
-    e0, e1, e2, e3, e4, e5 = evidence
-    for row in range(k + 3 * n):
-        place = row if row < k else k + 3 * rows[(row - k) // 3] + (row - k) % 3
-        g0, g1, g2, g3, g4, g5 = gain[:, row]
-        for column in range(row + 1):
-            line[column] = (
-                g0 * e0[column] + g1 * e1[column] + g2 * e2[column]
-                + g3 * e3[column] + g4 * e4[column] + g5 * e5[column]
-            )  # fmt: skip
-        vector[place] -= (
-            g0 * pull[0] + g1 * pull[1] + g2 * pull[2] + g3 * pull[3] + g4 * pull[4] + g5 * pull[5]
-        )
-        for column in range(min(row + 1, k)):
-            information[place, column] -= line[column]
-        for j in range((row + 1 - k + 2) // 3 if row >= k else 0):
-            at, base = k + 3 * rows[j], k + 3 * j
-            for a in range(3):
-                if base + a <= row:
-                    information[place, at + a] -= line[base + a]
-    wf = np.empty((3, k))
-    turned = np.empty((3, 3))
-    for i in range(n):
         place = k + 3 * rows[i]
         for a in range(3):
+            w0, w1, w2 = weight[i, a]
+            for c in range(6):
+                wj[a, c] = w0 * jacobian[0, c] + w1 * jacobian[1, c] + w2 * jacobian[2, c]
+            for m in range(k):
+                wf[3 * i + a, m] = w0 * modes[i, 0, m] + w1 * modes[i, 1, m] + w2 * modes[i, 2, m]
             for b in range(3):
                 turned[a, b] = (
                     rotation[0, a] * weight[i, 0, b] + rotation[1, a] * weight[i, 1, b]
                     + rotation[2, a] * weight[i, 2, b]
                 )  # fmt: skip
-            vector[place + a] += (
-                turned[a, 0] * offset[i, 0] + turned[a, 1] * offset[i, 1] + turned[a, 2] * offset[i, 2]
-            )
+        for c in range(6):
+            w0, w1, w2 = wj[0, c], wj[1, c], wj[2, c]
+            pull[c] += w0 * r[0] + w1 * r[1] + w2 * r[2]
+            for b in range(c + 1):
+                normal[c, b] += w0 * jacobian[0, b] + w1 * jacobian[1, b] + w2 * jacobian[2, b]
+            for m in range(k):
+                evidence[c, m] += w0 * modes[i, 0, m] + w1 * modes[i, 1, m] + w2 * modes[i, 2, m]
+            for a in range(3):
+                evidence[c, place + a] = w0 * rotation[0, a] + w1 * rotation[1, a] + w2 * rotation[2, a]
+        for a in range(3):
+            t0, t1, t2 = turned[a]
+            vector[place + a] += t0 * r[0] + t1 * r[1] + t2 * r[2]
             for b in range(a + 1):
                 information[place + a, place + b] += (
-                    turned[a, 0] * rotation[0, b]
-                    + turned[a, 1] * rotation[1, b]
-                    + turned[a, 2] * rotation[2, b]
+                    t0 * rotation[0, b] + t1 * rotation[1, b] + t2 * rotation[2, b]
                 )
             for m in range(k):
-                wf[a, m] = (
-                    weight[i, a, 0] * modes[i, 0, m] + weight[i, a, 1] * modes[i, 1, m]
-                    + weight[i, a, 2] * modes[i, 2, m]
-                )  # fmt: skip
-                information[place + a, m] += (
-                    turned[a, 0] * modes[i, 0, m] + turned[a, 1] * modes[i, 1, m]
-                    + turned[a, 2] * modes[i, 2, m]
-                )  # fmt: skip
+                information[place + a, m] += t0 * modes[i, 0, m] + t1 * modes[i, 1, m] + t2 * modes[i, 2, m]
         for m in range(k):
-            f0, f1, f2 = modes[i, 0, m], modes[i, 1, m], modes[i, 2, m]
-            vector[m] += wf[0, m] * offset[i, 0] + wf[1, m] * offset[i, 1] + wf[2, m] * offset[i, 2]
-            for b in range(m + 1):
-                information[m, b] += f0 * wf[0, b] + f1 * wf[1, b] + f2 * wf[2, b]
+            vector[m] += wf[3 * i, m] * r[0] + wf[3 * i + 1, m] * r[1] + wf[3 * i + 2, m] * r[2]
+    information[:k, :k] += np.dot(modes.reshape(3 * n, k).T, wf)
+    # L^-1 E and L^-1 pull by forward substitution.
+    lower = np.linalg.cholesky(normal)
+    for c in range(6):
+        for b in range(c):
+            pull[c] -= lower[c, b] * pull[b]
+            for m in range(len(vector)):
+                evidence[c, m] -= lower[c, b] * evidence[b, m]
+        pull[c] /= lower[c, c]
+        for m in range(len(vector)):
+            evidence[c, m] /= lower[c, c]
+            vector[m] -= evidence[c, m] * pull[c]
+    return evidence

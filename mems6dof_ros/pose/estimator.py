@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -46,7 +48,7 @@ class PoseEstimator:
     ``region``: where in the field the body is; None: anywhere. ``reference``: a constellation of an earlier
     session to start from; None: the first cycle founds one. ``field``: what is known of the field error,
     perhaps shared with other bodies; None: what the settings assume. ``constellation``, ``candidates`` and
-    ``centre`` may be read at any time.
+    ``centre`` may be read at any time, and are those of the last ``learn``.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class PoseEstimator:
         # Chained registration: error handed on, and which of the latest localizations the pose is from.
         self._chained = np.zeros((6, 6))
         self._in_solution = np.empty(0, bool)
+        self._lesson: Callable[[], None] | None = None
 
     # ------------------------------------------------------------------------------- cycles
 
@@ -92,8 +95,9 @@ class PoseEstimator:
         """Pose of the body in this cycle, from the localizations ``available`` (n,) (None: all).
 
         Bad data give a pose that says what is wrong; InputError is raised only where the arrays do not fit
-        together.
+        together. What this cycle teaches of the map is left to ``learn``.
         """
+        self.learn()
         order = (localizations.cycle, localizations.frame_counter)
         if self._last_frame is not None and order <= self._last_frame:
             cycle, frame = self._last_frame
@@ -112,9 +116,17 @@ class PoseEstimator:
             return self._lost(localizations, _too_few(localizations, view))
         return self._track(localizations, view, self.constellation)
 
+    def learn(self) -> None:
+        """Refine the map by the latest cycle: milliseconds now and then, so publish the pose first. The next
+        update begins with it where nobody has called."""
+        lesson, self._lesson = self._lesson, None
+        if lesson is not None:
+            lesson()
+
     def predict(self, cycle: int) -> tuple[Indices, Array] | None:
         """Identities (n,) and predicted positions (n, 3) m of the particles expected inside the field in
         ``cycle``; None while there is no pose to predict from."""
+        self.learn()
         if self.constellation is None or self._last is None:
             return None
         pose, _, _ = self._predicted(self._last, cycle)
@@ -132,6 +144,7 @@ class PoseEstimator:
 
     def snapshot(self) -> ReferenceConstellation:
         """The constellation as known now, in the body frame. Raises InputError where there is none."""
+        self.learn()
         if self.constellation is None:
             raise InputError("constellation", "none yet", "at least one cycle")
         return ReferenceConstellation.of(self.body, self.constellation, self._frame)
@@ -243,9 +256,11 @@ class PoseEstimator:
         if s.reference == "previous":
             in_solution = np.zeros(len(view.of), bool)
             in_solution[part] = solution.use > UNUSED
-            self._follow(view, constellation, state.pose, match, in_solution)
+            self._lesson = partial(self._follow, view, constellation, state.pose, match, in_solution)
         else:
-            self._learn(view, constellation, state, solution, match, part, modes, inside, factor)
+            self._lesson = partial(
+                self._learn, view, constellation, state, solution, match, part, modes, inside, factor
+            )
         if last is None:
             # The first pose in an adopted constellation is the reference; its frame is at the centre.
             self._frame = BodyFrame(
@@ -405,7 +420,15 @@ class PoseEstimator:
                 constellation.covariance[retired], former=True,
             )  # fmt: skip
         if constellation.due:
+            constellation.pivot[:2] = self._pivot()
             constellation.refine()
+
+    def _pivot(self) -> Array:
+        """Where in the field the body turns about, (2,) m, as well as known."""
+        centre = self.centre.estimate()
+        if centre is not None and centre.sd < CENTRE_KNOWN:
+            return centre.microscope
+        return np.zeros(2) if self.region is None else np.array(self.region.centre)
 
     def _learn_noise(self, constellation: Constellation, rows: Indices, solution: Solution) -> None:
         """Compare the residuals with what the covariances claim, over all particles and for each."""
@@ -419,7 +442,8 @@ class PoseEstimator:
         pose, candidates, gate = state.pose, self.candidates, self.settings.identity_gate
         if not len(newcomers.of) and not len(candidates):
             return
-        place = pose.inverse().apply(newcomers.position)
+        field = constellation.modes.evaluate(newcomers.position) @ constellation.field_mean
+        place = pose.inverse().apply(newcomers.position - field)
         jacobian = pose_jacobian(place, pose.rotation)
         covariance = newcomers.covariance + jacobian @ state.covariance @ jacobian.transpose(0, 2, 1)
         covariance = pose.rotation.T @ covariance @ pose.rotation

@@ -162,11 +162,7 @@ def _marginalise(moved, field, weight, residual, measured_covariance):  # type: 
     """
     n, k = len(moved), field.shape[2]
     size = k + 6
-    design = np.zeros((3 * n, size))
-    weighted = np.empty((3 * n, size))
-    normal, right = np.zeros((size, size)), np.zeros(size)
-    for m in range(k):
-        normal[m, m] = 1.0
+    design, weighted = np.zeros((3 * n, size)), np.empty((3 * n, size))
     for i in range(n):
         v = moved[i]
         for a in range(3):
@@ -182,13 +178,9 @@ def _marginalise(moved, field, weight, residual, measured_covariance):  # type: 
                 weighted[3 * i + a, m] = (
                     w0 * design[3 * i, m] + w1 * design[3 * i + 1, m] + w2 * design[3 * i + 2, m]
                 )
-        for a in range(3):
-            r = 3 * i + a
-            for m in range(size):
-                x = design[r, m]
-                right[m] += weighted[r, m] * residual[i, a]
-                for b in range(m + 1):
-                    normal[m, b] += x * weighted[r, b]
+    normal, right = np.dot(design.T, weighted), np.dot(residual.reshape(3 * n), weighted)
+    for m in range(k):
+        normal[m, m] += 1.0
     # Cholesky of the scaled matrix; the last six rows of its inverse are what the pose needs.
     scale = np.empty(size)
     for m in range(size):
@@ -220,28 +212,21 @@ def _marginalise(moved, field, weight, residual, measured_covariance):  # type: 
             x[m] *= scale[m] * (scale[k + q] if q < 6 else 1.0)
     covariance = rows[:6, k:].copy()
     step = rows[6]
-    noise = np.zeros((6, 6))
-    gain = np.empty((6, 3))
-    chi_square = 0.0
-    for m in range(k):
-        chi_square += step[m] * step[m]
+    gain = np.dot(rows[:6], weighted.T)
+    spread = np.empty((6, 3 * n))
     for i in range(n):
         for q in range(6):
             for a in range(3):
                 total = 0.0
-                for m in range(size):
-                    total += rows[q, m] * weighted[3 * i + a, m]
-                gain[q, a] = total
-        for q in range(6):
-            for a in range(3):
-                half = 0.0
                 for b in range(3):
-                    half += gain[q, b] * measured_covariance[i, b, a]
-                for p in range(6):
-                    noise[q, p] += half * gain[p, a]
-        for a in range(3):
-            for m in range(size):
-                residual[i, a] -= design[3 * i + a, m] * step[m]
+                    total += gain[q, 3 * i + b] * measured_covariance[i, b, a]
+                spread[q, 3 * i + a] = total
+    noise = np.dot(spread, gain.T)
+    residual -= np.dot(design, step).reshape(n, 3)
+    chi_square = 0.0
+    for m in range(k):
+        chi_square += step[m] * step[m]
+    for i in range(n):
         for a in range(3):
             for b in range(3):
                 chi_square += residual[i, a] * weight[i, a, b] * residual[i, b]

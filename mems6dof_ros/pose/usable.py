@@ -16,18 +16,23 @@ Mask = NDArray[np.bool_]
 
 #: Flags with which x and y are still good: their covariance says how good.
 LATERAL_ONLY = int(Flag.Z_AMBIGUOUS | Flag.NO_Z | Flag.Z_OUT_OF_RANGE)
+#: Flags with which a position is still good, but less than its covariance says: light of a neighbour, or a
+#: window cut by the edge of the image, adds an error about as large as the noise.
+DOUBTFUL, DOUBT = int(Flag.NEIGHBOUR | Flag.WINDOW_CUT), 2.0
 #: Standard deviation that stands for no knowledge of z, m.
 UNKNOWN_Z = 10e-6
 #: Standard deviations outside this range, m, are no measurement of a particle's place.
 CREDIBLE = (10e-12, 10e-6)
+#: Nor are positions this far from the centre of any field, m: squared they would overflow.
+FARTHEST = 1.0
 
 
 class Usable(NamedTuple):
     """Localizations with a finite position in the plane and sound covariances.
 
     ``of`` (n,): index in the message; ``position`` (n, 3) m and ``covariance`` (n, 3, 3) m^2, z replaced by
-    0 +- UNKNOWN_Z where not ``has_z`` (n,); ``good`` (n,): unflagged, may enter the solution. The
-    others only show that a particle is still there.
+    0 +- UNKNOWN_Z where not ``has_z`` (n,), variances DOUBT times larger where doubtful; ``good`` (n,): may
+    enter the solution. The others only show that a particle is still there.
     """
 
     of: Indices
@@ -52,7 +57,8 @@ def usable(localizations: Localizations, available: Mask | None = None) -> Usabl
     lateral = variance[:, 0] * variance[:, 1] - covariance[:, 0, 1] ** 2
     low, high = CREDIBLE[0] ** 2, CREDIBLE[1] ** 2
     credible = (variance >= low) & (variance <= high)
-    keep = np.isfinite(position[:, :2]).all(axis=1) & credible[:, 0] & credible[:, 1] & (lateral > 0)
+    near = np.abs(position) < FARTHEST  # not where NaN
+    keep = near[:, :2].all(axis=1) & credible[:, 0] & credible[:, 1] & (lateral > 0)
     keep &= np.isfinite(lateral) & ((flags & int(Flag.FIT_FAILED)) == 0)
     if available is not None:
         keep &= available
@@ -61,12 +67,13 @@ def usable(localizations: Localizations, available: Mask | None = None) -> Usabl
     a, b, c = covariance[:, 0, 1], covariance[:, 0, 2], covariance[:, 1, 2]
     xx, yy, zz = variance[of].T
     determinant = zz * lateral[of] - xx * c**2 - yy * b**2 + 2 * a * b * c
-    has_z = np.isfinite(position[:, 2]) & (determinant > 0) & credible[of, 2]
+    has_z = near[of, 2] & (determinant > 0) & credible[of, 2]
     has_z &= (flags & LATERAL_ONLY) == 0
     position[~has_z, 2] = 0.0
     covariance[~has_z, 2, :] = covariance[~has_z, :, 2] = 0.0
     covariance[~has_z, 2, 2] = UNKNOWN_Z**2
-    return Usable(of, position, covariance, has_z, (flags & ~LATERAL_ONLY) == 0)
+    covariance[(flags & DOUBTFUL) != 0] *= DOUBT
+    return Usable(of, position, covariance, has_z, (flags & ~(LATERAL_ONLY | DOUBTFUL)) == 0)
 
 
 def scaled(covariance: Array, factor: Array) -> Array:

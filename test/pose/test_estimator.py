@@ -10,11 +10,13 @@ import pytest
 
 from mems6dof_ros.analysis.truth import compare
 from mems6dof_ros.errors import InputError
+from mems6dof_ros.localization.localizations import Flag
 from mems6dof_ros.pose.bodies import Bodies, relative_pose
 from mems6dof_ros.pose.constellation_file import ReferenceConstellation
 from mems6dof_ros.pose.cycle_pose import Status
 from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings, Region
 from mems6dof_ros.pose.synthetic import GearMotion, Scene, SyntheticGear, make_localizations
+from mems6dof_ros.pose.usable import usable
 from mems6dof_ros.pose.validation import follow, interrupt, precision, two_bodies, unsteady_steps
 
 FIELD_ERRORS = Scene(field_error_xy=5e-9, field_error_z=30e-9)
@@ -281,7 +283,7 @@ def test_bad_localizations_are_left_out_or_lost_with_a_reason():
     covariance[10:12], covariance[12] = np.nan, -1e-18 * np.eye(3)
     covariance[13] = 1e-18 * np.ones((3, 3))
     flags = seen.flags.copy()
-    flags[14:20] = 8
+    flags[14:20] = Flag.POOR_FIT
     pose = estimator.update(replace(seen, position=position, covariance=covariance, flags=flags))
     assert pose.valid
     assert (pose.particle_id[:5] < 0).all()
@@ -289,6 +291,35 @@ def test_bad_localizations_are_left_out_or_lost_with_a_reason():
     assert (pose.particle_id[5:10] >= 0).sum() >= 4  # one may just have entered the field
     assert np.isnan(pose.residual[5:10, 2]).all()
     assert np.isfinite(pose.covariance).all()
+
+
+def test_doubtful_localizations_count_less():
+    """A neighbour or a cut window leaves a position of use, with twice the variance."""
+    estimator, seen, _ = observed()
+    flags = np.where(np.arange(len(seen)) % 2, 0, np.where(np.arange(len(seen)) % 4, 8, 2)).astype(np.uint32)
+    doubtful = usable(replace(seen, flags=flags))
+    assert doubtful.good.all()
+    factor = np.where(flags > 0, 2.0, 1.0)
+    assert np.allclose(doubtful.covariance, factor[:, None, None] * usable(seen).covariance)
+    pose = estimator.update(replace(seen, flags=flags))
+    assert (pose.particle_id[flags > 0] >= 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("reference", ["map", "previous"])
+def test_learning_may_wait_until_the_pose_is_out(reference):
+    """The same poses, whether ``learn`` is called after every update, or never."""
+    gear = SyntheticGear(Scene(particles=40), 11)
+    prompt, late = (PoseEstimator(PoseSettings(reference=reference)) for _ in range(2))
+    for _ in range(12):
+        gear.advance()
+        seen, _ = gear.observe()
+        first, other = prompt.update(seen), late.update(seen)
+        prompt.learn()
+        assert np.array_equal(first.covariance, other.covariance)
+        assert np.array_equal(first.displacement, other.displacement)
+    assert prompt.constellation.cycles == late.constellation.cycles + 1
+    late.learn()
+    assert np.array_equal(prompt.constellation.position, late.constellation.position)
 
 
 @pytest.mark.parametrize("reference", ["map", "previous"])

@@ -53,8 +53,14 @@ class Bodies:
             poses.append(pose)
         return poses
 
+    def learn(self) -> None:
+        """Refine the maps by the latest cycle, see PoseEstimator.learn."""
+        for estimator in self.estimators:
+            estimator.learn()
+
     def measured_field(self) -> FieldError:
         """The field error by all cycles so far. Raises InputError before the first."""
+        self.learn()
         constellations = [estimator.constellation for estimator in self.estimators if estimator.constellation]
         if not constellations:
             raise InputError("field error", "no cycle yet", "cycles of a body that turns")

@@ -19,7 +19,7 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from mems6dof_ros.pose.field import FieldError
-from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, lever_jacobian, rotation_z
+from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, rotation_z
 from mems6dof_ros.pose.solve import pose_jacobian
 
 Array = NDArray[np.float64]
@@ -76,8 +76,6 @@ class Constellation:
         self._vector = np.zeros(len(modes))
         self._eliminated: list[Array] = []  # of every cycle since: what its pose took, see observe
         self._refined_at = 0
-        #: Where in the field the body turns about, m.
-        self.pivot = np.zeros(3)
         self._latest = IDENTITY
         self._frames = np.zeros((2, 6, len(modes)))
 
@@ -156,8 +154,7 @@ class Constellation:
         of the motion but a constant of the frames (see ``_constant_response``).
         """
         microscope, body = self._frames
-        constant = lever_jacobian(pose.translation) @ microscope
-        constant += (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
+        constant = microscope + (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
         return _field_response(
             rows, modes, self.coupling, pose.rotation, self.position, constant, self.field_factor
         )
@@ -246,22 +243,19 @@ class Constellation:
         an unknown constant is not an error of motion.
         """
         around, responses = [], []
-        scale = np.r_[np.ones(3), np.full(3, 1 / max(self.modes.half_size))]  # m per m, rad per m
         for angle in np.arange(AROUND) * (math.tau / AROUND):
-            turn = rotation_z(angle)
-            pose = self._latest.then(RigidPose(turn, self.pivot - turn @ self.pivot))
+            pose = self._latest.then(RigidPose(rotation_z(angle), np.zeros(3)))
             place = pose.apply(self.position)
             seen = np.flatnonzero((np.abs(place[:, :2]) < self.modes.half_size).all(axis=1))
             if len(seen) >= 8:
-                of_body = np.kron(np.eye(2), pose.rotation)
-                around.append(np.c_[lever_jacobian(pose.translation), of_body] / scale[:, None])
-                responses.append(self._response(pose, place, seen) / scale[:, None])
-        if not around:
-            return np.zeros((2, 6, len(self.modes)))
-        columns = np.r_[scale, scale]
-        design = np.concatenate(around) * columns
-        solution = np.linalg.lstsq(design, np.concatenate(responses), rcond=1e-3)[0]
-        return np.asarray((columns[:, None] * solution).reshape(2, 6, -1))
+                around.append(np.c_[np.eye(3), pose.rotation])
+                responses.append(self._response(pose, place, seen))
+        constants = np.zeros((2, 6, len(self.modes)))
+        for part in (slice(0, 3), slice(3, 6)) if around else ():
+            stacked = np.concatenate([response[part] for response in responses])
+            solution = np.linalg.lstsq(np.concatenate(around), stacked, rcond=1e-3)[0]
+            constants[0, part], constants[1, part] = solution[:3], solution[3:]
+        return constants
 
     def _response(self, pose: RigidPose, place: Array, seen: Indices) -> Array:
         """Change (6, k) of a pose with the coefficients of the field error, particles ``seen``."""

@@ -420,15 +420,7 @@ class PoseEstimator:
                 constellation.covariance[retired], former=True,
             )  # fmt: skip
         if constellation.due:
-            constellation.pivot[:2] = self._pivot()
             constellation.refine()
-
-    def _pivot(self) -> Array:
-        """Where in the field the body turns about, (2,) m, as well as known."""
-        centre = self.centre.estimate()
-        if centre is not None and centre.sd < CENTRE_KNOWN:
-            return centre.microscope
-        return np.zeros(2) if self.region is None else np.array(self.region.centre)
 
     def _learn_noise(self, constellation: Constellation, rows: Indices, solution: Solution) -> None:
         """Compare the residuals with what the covariances claim, over all particles and for each."""

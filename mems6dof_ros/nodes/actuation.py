@@ -17,6 +17,7 @@ from std_srvs.srv import SetBool
 from mems6dof_msgs.msg import ActuationAcknowledgement, ActuationCommand
 from mems6dof_ros.control.actuator import Actuator
 from mems6dof_ros.control.commands import Acknowledgement, Command, Motion, Outcome
+from mems6dof_ros.errors import InputError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.messages import nanoseconds
@@ -112,7 +113,9 @@ def acknowledgement_message(acknowledgement: Acknowledgement) -> ActuationAcknow
 
 
 def to_acknowledgement(message: ActuationAcknowledgement) -> Acknowledgement:
-    """The core type."""
+    """The core type; InputError for a status that there is not."""
+    if message.status not in set(Outcome):
+        raise InputError("ActuationAcknowledgement.status", f"{message.status}", f"0 to {max(Outcome):d}")
     return Acknowledgement(
         message.id,
         Outcome(message.status),

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import shared_memory
 
 _SHARED_MEMORY = shared_memory.FOLDER
@@ -83,7 +83,10 @@ def _free_shared_memory(otherwise: int) -> int:
 
 
 def stamp_of(data: bytes) -> int:
-    """Stamp, ns, of a serialized message that begins with a header: 4 bytes of CDR, then two integers."""
+    """Stamp, ns, of a serialized message that begins with a header: 4 bytes of CDR, then two integers;
+    InputError where it is shorter."""
+    if len(data) < 12:
+        raise InputError("serialized message", f"{len(data)} bytes", "a header")
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
 

@@ -36,9 +36,10 @@ class _Topic:
 
     def note(self, message: Any) -> None:
         self.count += 1
-        if not hasattr(message, "header"):
+        time = getattr(getattr(message, "header", None), "stamp", None)
+        if not hasattr(time, "sec") or not hasattr(time, "nanosec"):
             return
-        stamp = messages.nanoseconds(message.header.stamp)
+        stamp = messages.nanoseconds(time)
         self.stamps[stamp] += 1
         self.backwards += stamp < self.last
         self.last = stamp

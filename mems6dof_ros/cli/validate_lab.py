@@ -16,6 +16,11 @@ from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
 #: (text) and passed (None: for information).
 PARTS = {
     "messages": "mems6dof_ros.nodes.hostile",
+    "outages": "mems6dof_ros.nodes.outages",
+    "bags": "mems6dof_ros.recording.validation.bags",
+    "crash": "mems6dof_ros.recording.validation.crash",
+    "disk": "mems6dof_ros.recording.validation.disk",
+    "files": "mems6dof_ros.recording.validation.fuzzing",
 }
 
 
@@ -23,7 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Options: which parts, the seed of what is random, where to work."""
     parser = subparsers.add_parser(
         "lab",
-        help="what the instrument survives: broken messages, and more",
+        help="what the instrument survives: broken messages and files, crashes, full disks",
         description="Do to the nodes what happens in a laboratory and print what became of them. The exit"
         " status is 1 when a figure misses its requirement.",
     )

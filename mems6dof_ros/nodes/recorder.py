@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mcap.writer import MCAP0_MAGIC
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -35,6 +34,7 @@ from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import COMPRESSIONS, BagWriter, Channel, Qos
+from mems6dof_ros.recording.recover import interrupted
 
 #: Types of the topics that we know before anybody publishes them.
 KNOWN_TYPES = {
@@ -322,7 +322,7 @@ class RecorderNode(InstrumentNode):
         if not output:
             return f"recording_{datetime.datetime.now():%Y%m%d_%H%M%S}"
         path = f"{output}_{self._bags}" if self._bags else output
-        while _interrupted(Path(path)):
+        while interrupted(Path(path)):
             self.get_logger().warning(f"{path} was interrupted: mems6dof recover {path}")
             self._bags += 1
             path = f"{output}_{self._bags}"
@@ -422,16 +422,6 @@ class RecorderNode(InstrumentNode):
 
 def _attach(bag: BagWriter, name: str, text: str) -> None:
     bag.attach(name, text.encode(), "application/yaml")
-
-
-def _interrupted(path: Path) -> bool:
-    """True for the bag of a recorder that could not complete it: a file without the magic at its end."""
-    for file in path.glob("*.mcap"):
-        with file.open("rb") as stream:
-            stream.seek(max(file.stat().st_size - len(MCAP0_MAGIC), 0))
-            if stream.read() != MCAP0_MAGIC:
-                return True
-    return False
 
 
 def main(args: list[str] | None = None) -> int:

@@ -26,7 +26,7 @@ from rosbags.highlevel import AnyReader
 
 from mems6dof_ros import __version__
 from mems6dof_ros.errors import InputError
-from mems6dof_ros.recording.definitions import definition, typestore
+from mems6dof_ros.recording.definitions import PACKAGE, definition, named_types, typestore
 from mems6dof_ros.recording.messages import Message, serialize
 from mems6dof_ros.recording.metadata import (
     PROVENANCE,
@@ -40,6 +40,24 @@ from mems6dof_ros.recording.recover import complete_file, mcap_files
 
 __all__ = ["BagReader", "BagWriter", "Channel", "Qos", "Recorded"]
 
+#: Types whose fields are read here, rather than passed on.
+INTERPRETED = frozenset(
+    (
+        "sensor_msgs/msg/Image",
+        *(
+            f"{PACKAGE}/msg/{name}"
+            for name in (
+                "FrameInfo",
+                "GroundTruth",
+                "Localizations",
+                "Pose6DOF",
+                "ActuationCommand",
+                "ActuationAcknowledgement",
+                "ControllerState",
+            )
+        ),
+    )
+)
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 
@@ -321,7 +339,8 @@ class Recorded(NamedTuple):
 class BagReader:
     """Reads a rosbag2 directory (MCAP or sqlite3) or a single file of one; a context manager.
 
-    Anybody's bag: types come from the definitions in the bag, else from ROS 2 Jazzy's.
+    Anybody's bag: types come from the definitions in the bag, else from ROS 2 Jazzy's. Of types that are
+    INTERPRETED here, all fields that we know must be there.
     Raises InputError where the bag cannot be read, also while iterating.
     """
 
@@ -371,9 +390,24 @@ class BagReader:
         if not chosen:
             return
         with _readable(self.path):
+            for typename in {connection.msgtype for connection in chosen} & INTERPRETED:
+                self._compare_definition(typename)
             for connection, log_time_ns, data in self._reader.messages(chosen):
                 message = self._reader.deserialize(data, connection.msgtype)
                 yield Recorded(connection.topic, connection.msgtype, log_time_ns, message)
+
+    def _compare_definition(self, typename: str) -> None:
+        """Raise InputError where the bag's definition lacks a field of ours, or has it of another type."""
+        pending, seen = [typename], set()
+        while pending:
+            name = pending.pop()
+            seen.add(name)
+            theirs = dict(self._reader.typestore.fielddefs[name][1])
+            for field, node in typestore().fielddefs[name][1]:
+                if theirs.get(field) != node:
+                    found = f"{name} without '{field}' as we know it"
+                    raise InputError(str(self.path), found, f"{typename} as of this version")
+                pending += [used for used in map(str, named_types(node)) if used not in seen]
 
     def attachments(self) -> dict[str, bytes]:
         """Attachments by name; of several with one name, the last."""

@@ -87,13 +87,14 @@ def _with_dependencies(typename: str) -> dict[str, str]:
         if name not in texts:
             texts[name] = _text(name)
             _, fields = get_types_from_msg(texts[name], name)[name]
-            pending += [str(used) for _, node in fields for used in _named_types(node)]
+            pending += [str(used) for _, node in fields for used in named_types(node)]
     return texts
 
 
-def _named_types(node: tuple) -> Iterator[str]:
+def named_types(node: tuple) -> Iterator[str]:
+    """Types that a field of a definition is made of, other than numbers and texts."""
     kind, what = node
     if kind == Nodetype.NAME:
         yield what
     elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        yield from _named_types(what[0])
+        yield from named_types(what[0])

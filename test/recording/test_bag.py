@@ -15,6 +15,7 @@ import yaml
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
@@ -243,16 +244,35 @@ def test_a_truncated_bag_is_one_clear_error(tmp_path):
 
 
 def test_sqlite_bags_of_rosbags_are_read(tmp_path):
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as RosbagsWriter
 
     from mems6dof_ros.recording.definitions import typestore
 
-    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with RosbagsWriter(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection("/image_raw", "sensor_msgs/msg/Image", typestore=typestore())
         for k in range(3):
             writer.write(connection, T0 + k, messages.serialize(messages.image(frame(k))))
     with BagReader(tmp_path / "bag") as bag:
         assert [m.message.data[0] for m in bag.messages(["/image_raw"])] == [0, 1, 2]
+
+
+def test_messages_of_another_version_are_refused(tmp_path):
+    """A definition that lacks a field of ours, or has it of another type, in the bag or in what it is made of."""
+    ours = definition("sensor_msgs/msg/Image").schema
+    for k, (old, new) in enumerate([("uint32 step", "uint16 step"), ("uint32 nanosec", "uint32 rest")]):
+        assert old in ours
+        with (tmp_path / f"{k}.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start(profile="ros2")
+            schema = writer.register_schema(
+                "sensor_msgs/msg/Image", "ros2msg", ours.replace(old, new).encode()
+            )
+            channel = writer.register_channel("/image_raw", "cdr", schema)
+            writer.add_message(channel, T0, bytes(messages.serialize(messages.image(frame(0)))), T0)
+            writer.finish()
+        with BagReader(tmp_path / f"{k}.mcap") as bag, pytest.raises(InputError, match=f"'{old.split()[1]}'"):
+            list(bag.messages())
 
 
 def test_an_almost_full_disk_ends_with_a_complete_bag(tmp_path, monkeypatch):

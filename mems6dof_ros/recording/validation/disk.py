@@ -21,9 +21,10 @@ from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
 from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
-from mems6dof_ros.recording.validation.bags import SMALL
+from mems6dof_ros.recording.validation.bags import SMALL, with_camera
 from mems6dof_ros.recording.validation.processes import witnessed_recorder
 from mems6dof_ros.recording.validation.rows import Figure, at_least, exactly, information
+from mems6dof_ros.simulation.settings import SimulationSettings
 
 #: Of the disk that is filled, and what the recorder must leave of it, MiB.
 DISK, RESERVE = 48, 8
@@ -94,22 +95,11 @@ def slow(work: Path, seed: int, seconds: float) -> Iterator[Figure]:
 def beside(work: Path, seed: int, seconds: float) -> Iterator[Figure]:
     """A recorder of everything, frames too, beside a run to its end, in files of two seconds."""
     cycles = round(RATE * seconds)
-    settings = {f"simulator.{name}": value for name, value in {**SMALL, "seed": seed}.items()}
-    source = NodeSpec(
-        "frame_source",
-        {
-            "source": "simulator",
-            "pacing": "consumer",
-            "acknowledged_by": topics.POSE_6DOF,
-            "simulator.loop": 16,
-            "simulator.cycles": cycles,
-            **settings,
-        },
-        ends_system=True,
-    )
+    paced = {"pacing": "consumer", "acknowledged_by": topics.POSE_6DOF, "simulator.cycles": cycles}
+    source = NodeSpec("frame_source", {**_simulated(seed), **paced}, ends_system=True)
     recorded = [*DEFAULT_TOPICS, topics.IMAGE]
     nodes = chain(source, calibration="", output=str(work / "bag"), recorded=recorded)
-    nodes = [_with(node, "recorder", split_duration=2.0) for node in nodes]
+    nodes = [_with(node, "recorder", split_duration=2.0) for node in with_camera(nodes, _settings(seed))]
     work.mkdir(parents=True)
     with run_system(nodes, namespace=f"disk_{os.getpid()}", on_line=lambda line: None) as system:
         system.wait("frame_source", timeout=300.0)
@@ -193,11 +183,7 @@ class _Watch(Intruder):
 @contextlib.contextmanager
 def _instrument(seed: int, output: Path | None, **of_recorder: Any) -> Iterator[_Watch]:
     """The chain at RATE with a small gear, watched; where there is an output, with a recorder of all."""
-    settings = {f"simulator.{name}": value for name, value in {**SMALL, "seed": seed}.items()}
-    source = NodeSpec(
-        "frame_source",
-        {"source": "simulator", "pacing": "rate", "rate": RATE, "simulator.loop": 16, **settings},
-    )
+    source = NodeSpec("frame_source", {**_simulated(seed), "pacing": "rate", "rate": RATE})
     nodes = chain(
         source,
         calibration="",
@@ -205,7 +191,7 @@ def _instrument(seed: int, output: Path | None, **of_recorder: Any) -> Iterator[
         recorded=[*DEFAULT_TOPICS, topics.IMAGE],
         watched={topics.POSE_6DOF: "intruder"},
     )
-    nodes = [_with(node, "recorder", **of_recorder) for node in nodes]
+    nodes = [_with(node, "recorder", **of_recorder) for node in with_camera(nodes, _settings(seed))]
     namespace = f"disk_{os.getpid()}"
     watch, lines = _Watch(namespace), list[str]()
     with watch, run_system(nodes, namespace=namespace, on_line=lines.append) as system:
@@ -218,6 +204,16 @@ def _instrument(seed: int, output: Path | None, **of_recorder: Any) -> Iterator[
         yield watch
         watch.check = lambda: None
         watch.failed = sum(map(bool, system.stop().values()))
+
+
+def _settings(seed: int) -> SimulationSettings:
+    return SimulationSettings.from_dict({**SMALL, "seed": seed})
+
+
+def _simulated(seed: int) -> dict[str, Any]:
+    """Parameters of a source that can deliver at any rate."""
+    settings = {f"simulator.{name}": value for name, value in {**SMALL, "seed": seed}.items()}
+    return {"source": "simulator", "simulator.loop": 16, **settings}
 
 
 def _with(node: NodeSpec, executable: str, **parameters: Any) -> NodeSpec:

@@ -1,8 +1,7 @@
-"""Traffic and recorders in processes of their own, and what a killed one leaves in shared memory."""
+"""Traffic and recorders in processes of their own."""
 
 from __future__ import annotations
 
-import fcntl
 import os
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.parameters import to_yaml
+from mems6dof_ros.nodes.shared_memory import remove_abandoned
 from mems6dof_ros.recording.validation.traffic import CYCLE, Journal
 
 TOPICS = [topic for _, topic in CYCLE]
@@ -67,24 +67,9 @@ def until(condition: Callable[[], Any], what: str, timeout: float = 60.0) -> Non
 
 
 def kill(process: subprocess.Popen[str]) -> int:
-    """By SIGKILL; returns the monotonic time, ns, just before. Removes what it leaves in shared memory."""
-    maps = Path(f"/proc/{process.pid}/maps").read_text(encoding="utf-8")
-    segments = {Path(line.split()[-1]) for line in maps.splitlines() if "/dev/shm/fastrtps_" in line}
+    """By SIGKILL; returns the monotonic time, ns, just before."""
     now = time.monotonic_ns()
     process.kill()
     process.wait()
-    for segment in segments:
-        _remove_if_orphaned(segment)
+    remove_abandoned()
     return now
-
-
-def _remove_if_orphaned(segment: Path) -> None:
-    """Fast DDS keeps a lock on a file beside each segment while its owner lives."""
-    lock = segment.with_name(f"{segment.name}_el")
-    try:
-        with lock.open("r+b") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            segment.unlink(missing_ok=True)
-            lock.unlink()
-    except OSError:
-        return  # it lives, or is gone

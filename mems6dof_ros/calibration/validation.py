@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
 from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.field_validation import field_figures
 from mems6dof_ros.calibration.file import Calibration
 from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, FocusStack, measure_stack
 from mems6dof_ros.calibration.real_stacks import (
@@ -191,6 +192,7 @@ def figures(
         sign_change_figures,
         range_figures,
         bad_stack_figures,
+        lambda seeds: field_figures(seeds, lambda seed: _calibration("paper", seed, 1e5)),
     ]
     table: list[Figure] = []
     steps = len(parts) + 1

@@ -71,9 +71,10 @@ class Scene:
 
 
 class SyntheticGear:
-    """Cycles of one body in a Scene; everything follows from ``seed``."""
+    """Cycles of one body in a Scene; everything follows from ``seed``, the field error from ``optics`` where
+    that is given: bodies in one field have it in common."""
 
-    def __init__(self, scene: Scene, seed: int, body: str = "load_gear") -> None:
+    def __init__(self, scene: Scene, seed: int, body: str = "load_gear", optics: int | None = None) -> None:
         self.scene, self.body = scene, body
         self.random = np.random.default_rng([seed, 20231])
         n = scene.particles
@@ -84,7 +85,8 @@ class SyntheticGear:
         self.scale = np.exp(self.random.normal(0, scene.spread, n))
         self.psi = float(self.random.uniform(-math.pi, math.pi))
         self.cycle = 0
-        self._waves = self.random.normal(size=(3, 6, 4))
+        waves = self.random if optics is None else np.random.default_rng([optics, 20232])
+        self._waves = waves.normal(size=(3, 6, 4))
 
     def field_error(self, position: Array) -> Array:
         """Static error (n, 3) m at ``position``: a sum of long waves, not of the estimator's polynomials."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import functools
+import gc
 import os
 import signal
 import sys
@@ -26,6 +28,7 @@ from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.health import Health
 from mems6dof_ros.nodes.lifecycle import ManagedNode
 from mems6dof_ros.nodes.parameters import AUTOSTART, Parameter, declare
+from mems6dof_ros.nodes.stream import Stream
 from mems6dof_ros.nodes.worker import Worker
 
 #: Environment variable by which the runner, or `launch`, tells a node its process id.
@@ -68,7 +71,8 @@ class WhileRoom(CallbackGroup):
 
 
 class InstrumentNode(ManagedNode):
-    """A managed node with declared parameters, ``values`` by name, ``health``, and perhaps a ``worker``.
+    """A managed node with declared parameters, ``values`` by name, ``health``, perhaps a ``worker`` and a
+    ``stream`` that feeds it.
 
     ``finished`` set from any thread ends the process in good order, ``failure`` with its exception.
     """
@@ -78,6 +82,7 @@ class InstrumentNode(ManagedNode):
         self.values = declare(self, (AUTOSTART, *parameters), lambda: self.lifecycle)
         self.health = Health(self)
         self.worker: Worker[Any] | None = None
+        self.stream: Stream | None = None
         self.finished = threading.Event()
         self.failure: BaseException | None = None
         self._rehearsal: threading.Thread | None = None
@@ -98,9 +103,31 @@ class InstrumentNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Finish what is queued; before what else a node does."""
+        if self.stream:
+            self.stream.ask_to_end()
         if self.worker and (left := self.worker.end()):
             self.health.lost(left, f"{left} messages left in the queue")
-        self.worker = None
+        if self.stream:
+            self.stream.end()
+        self.worker = self.stream = None
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **options: Any
+    ) -> Any:
+        """As rclpy's, but a message that ``callback`` raises InputError for, or cannot decode, is refused."""
+
+        @functools.wraps(callback)
+        def take(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except InputError as error:
+                self.health.refused(f"{topic}: {error}")
+            except RuntimeError as error:
+                if "failed to deserialize" not in str(error):
+                    raise
+                self.health.refused(f"{topic}: {len(arguments[0])} bytes that are no {msg_type.__name__}")
+
+        return super().create_subscription(msg_type, topic, take, qos_profile, **options)
 
     def start_worker(self, work: Callable[[Any], None], capacity: int | None = None) -> Worker[Any]:
         """A worker until the node is deactivated, with the queue that the parameters describe, or of
@@ -110,6 +137,15 @@ class InstrumentNode(ManagedNode):
         self.worker = Worker(work, capacity, self.values["queue_policy"], wake.trigger)
         self.health.gauge("queue", lambda: len(self.worker or ()))
         return self.worker
+
+    def make_stream(self, tick: Callable[[], None] = lambda: None) -> Stream:
+        """A stream until the node is deactivated, to be begun once it is subscribed to something."""
+
+        def failed(error: BaseException) -> None:
+            self.failure = error
+
+        self.stream = Stream(self, failed, tick)
+        return self.stream
 
     def when_ready(
         self,
@@ -145,6 +181,8 @@ class InstrumentNode(ManagedNode):
                     tell_at, interval = time.monotonic() + interval, 2 * interval
                 return
             timer.cancel()
+            gc.collect()
+            gc.freeze()  # what is there by now stays; to look through it again takes 50 ms now and then
             act()
 
         timer = self.create_timer(0.02, look, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -19,7 +19,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
 from mems6dof_msgs.msg import FrameInfo, Pose6DOF
@@ -35,7 +34,7 @@ from mems6dof_ros.localization.localizations import FIT_PARAMETERS, GaussianFits
 from mems6dof_ros.localization.localizer import Localizer, LocalizerSettings
 from mems6dof_ros.localization.tracking import TrackingLocalizer, TrackingSettings
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
+from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
 from mems6dof_ros.nodes.frame_order import Arrival, FrameOrder
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
@@ -164,26 +163,30 @@ class LocalizerNode(InstrumentNode):
         self._poses: deque[CyclePose] = deque(maxlen=16)
         self._dropped = 0
         self.start_worker(self._localize)
-        if self._output.tracker:
-            self.create_subscription(Pose6DOF, topics.POSE_6DOF, self._on_pose, transport.MESSAGES)
         missing = self.missing_subscribers({topics.LOCALIZATIONS: self._output.publisher})
         self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.localizer))
 
     def _subscribe(self) -> None:
-        self.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES)
-        assert self.worker is not None
-        self.create_subscription(
-            Image, topics.IMAGE, self._on_image, transport.FRAMES, callback_group=WhileRoom(self.worker)
-        )
-        self.create_timer(0.1, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        stream = self.make_stream(self._on_tick)
+        if self._output.tracker:
+            stream.subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
+        stream.subscribe(FrameInfo, topics.FRAME_INFO, self._on_info)
+        stream.subscribe(Image, topics.IMAGE, self._on_image, transport.FRAMES, raw=True)
+        stream.begin()
         self.tell("ready")
 
     def _on_info(self, info: FrameInfo) -> None:
         self._matcher.add_info(messages.nanoseconds(info.header.stamp), info)
         self._forward()
 
-    def _on_image(self, image: Image) -> None:
-        self._matcher.add_image(messages.nanoseconds(image.header.stamp), image, time.time_ns())
+    def _on_image(self, data: bytes) -> None:
+        arrival_ns = time.time_ns()
+        try:
+            image = messages.deserialize(data, "sensor_msgs/msg/Image")  # its pixels stay where they are
+        except Exception as error:  # whatever a reader of nonsense stumbles over
+            self.health.refused(f"an image that cannot be read: {error!r}")
+            return
+        self._matcher.add_image(messages.nanoseconds(image.header.stamp), image, arrival_ns)
         self._forward()
 
     def _on_pose(self, pose: Pose6DOF) -> None:

@@ -28,7 +28,7 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, WhileRoom, run
+from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.frame_order import Arrival, CycleCount, FrameOrder
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
 from mems6dof_ros.nodes.sim_time import on_jump_back
@@ -251,14 +251,9 @@ class PoseEstimatorNode(InstrumentNode):
         self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.settings))
 
     def _subscribe(self) -> None:
-        assert self.worker is not None
-        self.create_subscription(
-            LocalizationsMessage,
-            topics.LOCALIZATIONS,
-            self._on_localizations,
-            transport.MESSAGES,
-            callback_group=WhileRoom(self.worker),
-        )
+        stream = self.make_stream()
+        stream.subscribe(LocalizationsMessage, topics.LOCALIZATIONS, self._on_localizations)
+        stream.begin()
         self.tell("ready")
 
     def _on_localizations(self, message: LocalizationsMessage) -> None:

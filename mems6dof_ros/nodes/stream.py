@@ -1,0 +1,115 @@
+"""Subscriptions with a thread of their own, for what arrives with every motion cycle."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from mems6dof_ros.nodes import transport
+
+
+class OutOfExecutor(CallbackGroup):
+    """Keeps what is in it out of what an executor waits for."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Stream:
+    """Waits for a few topics only and calls back in its own thread; ``subscribe``, ``begin``, ``end``.
+
+    An executor of rclpy builds its list of all that a node has (parameter and lifecycle services, timers)
+    anew each time it waits, which takes half a millisecond of Python. A callback may block, as Worker.put
+    does: what arrives meanwhile stays in the middleware, and the executor goes on. ``tick`` is called every
+    ``period`` s, later after a callback that was blocked. An exception ends the thread and is given to
+    ``failed``.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        failed: Callable[[BaseException], None],
+        tick: Callable[[], None] = lambda: None,
+        period: float = 0.1,
+    ) -> None:
+        self._node, self._failed, self._tick, self._period = node, failed, tick, period
+        self._group = OutOfExecutor()
+        self._subscriptions: list[tuple[Any, Callable[[Any], None]]] = []
+        self._wake = GuardCondition(None, None, context=node.context)
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name="stream", daemon=True)
+
+    def subscribe(
+        self,
+        kind: type,
+        topic: str,
+        act: Callable[[Any], None],
+        quality: QoSProfile = transport.MESSAGES,
+        raw: bool = False,
+    ) -> None:
+        """Before ``begin``: call ``act`` with each message, ``raw``: serialized. Of what has arrived
+        together, the topic that was subscribed to first comes first. The node destroys the subscription."""
+        subscription = self._node.create_subscription(
+            kind, topic, act, quality, callback_group=self._group, raw=raw
+        )
+        self._subscriptions.append((subscription, act))
+
+    def begin(self) -> None:
+        """Take messages from now on."""
+        self._thread.start()
+
+    def ask_to_end(self) -> None:
+        """Take no more messages."""
+        self._ending = True
+        self._wake.trigger()
+
+    def end(self) -> None:
+        """Take no more messages, and wait for the callback that runs."""
+        self.ask_to_end()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            with ExitStack() as held:
+                handles = [subscription.handle for subscription, _ in self._subscriptions]
+                guard, context = self._wake.handle, self._node.context.handle
+                for handle in (*handles, guard, context):
+                    held.enter_context(handle)
+                waiting = _rclpy.WaitSet(len(handles), 1, 0, 0, 0, 0, context)
+                ticked = time.monotonic()
+                while not self._ending and self._node.context.ok():
+                    waiting.clear_entities()
+                    for handle in handles:
+                        waiting.add_subscription(handle)
+                    waiting.add_guard_condition(guard)
+                    waiting.wait(max(int((ticked + self._period - time.monotonic()) * 1e9), 0))
+                    self._take()
+                    if time.monotonic() - ticked >= self._period:
+                        self._tick()
+                        ticked = time.monotonic()
+        except BaseException as error:  # handed to the main thread, which ends the node
+            self._failed(error)
+
+    def _take(self) -> None:
+        for subscription, act in self._subscriptions:
+            while not self._ending:
+                found = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if found is None:
+                    break
+                act(found[0])

@@ -93,10 +93,11 @@ def stamp_of(data: bytes) -> int:
 
 def keep_large_buffers() -> None:
     """Let glibc reuse the memory of frames instead of returning it to the kernel after each."""
-    trim_threshold, mmap_threshold = -1, -3  # malloc.h
+    trim_threshold, mmap_threshold, most_arenas = -1, -3, -8  # malloc.h
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another C library
         return
     mallopt(mmap_threshold, 32 * _MEBIBYTE)  # the greatest it accepts
     mallopt(trim_threshold, 512 * _MEBIBYTE)
+    mallopt(most_arenas, 1)  # those of other threads than the first return memory all the same

@@ -22,9 +22,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--optical-cycles",
         type=int,
-        default=0,
-        help="also run so many cycles from rendered frames, calibration included, for the first three seeds:"
-        " minutes (default: none)",
+        default=240,
+        help="cycles from rendered frames, calibration included, on the optics of the first three seeds;"
+        " after the first revolution, 80 cycles, they count; 0: none (default: %(default)s)",
     )
     add_json_option(parser)
     parser.set_defaults(run=run)
@@ -38,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.drift_cycles < 200:
         raise InputError("--drift-cycles", f"{args.drift_cycles}", "200 or more")
+    if 0 != args.optical_cycles < 120:
+        raise InputError("--optical-cycles", f"{args.optical_cycles}", "0 or 120 or more")
     with Progress("validate pose") as progress:
         table = figures(args.seeds, progress, args.drift_cycles, args.optical_cycles)
     parameters = {

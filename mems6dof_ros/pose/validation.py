@@ -21,6 +21,7 @@ from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.pose.bodies import Bodies
 from mems6dof_ros.pose.cycle_pose import DEGREES_OF_FREEDOM, CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings, Region
+from mems6dof_ros.pose.rigid import RigidPose, log_so3
 from mems6dof_ros.pose.solve import pose_jacobian
 from mems6dof_ros.pose.synthetic import GearMotion, Scene, SyntheticGear, make_localizations, merged
 
@@ -109,6 +110,21 @@ def follow(
             gear.advance(*next(plan))
         run.update(estimator, gear, *gear.observe())
     return run
+
+
+def chained_nees(seed: int, cycles: int = 60) -> float:
+    """NEES/6 of the last of ``cycles`` poses registered each to the micrograph before, against truth since
+    the first micrograph. Constants fitted to all of a random walk would swallow a good part of it."""
+    settings = PoseSettings(reference="previous", recentre_at=())
+    run = follow(Scene(particles=60), seed, cycles, settings)
+    first, last = run.poses[0], run.poses[-1]
+    body = RigidPose(first.rotation, first.translation).then(
+        RigidPose(run.truths[0].rotation, run.truths[0].translation).inverse()
+    )
+    true = body.then(RigidPose(run.truths[-1].rotation, run.truths[-1].translation))
+    error = np.r_[last.translation - true.translation, log_so3(last.rotation @ true.rotation.T)]
+    # The first micrograph's own noise is in the frame that its particles define.
+    return float(error @ np.linalg.solve(last.covariance + first.covariance, error)) / 6
 
 
 def theory(truth: GroundTruth, sd_xy: float, sd_z: float) -> Array:
@@ -237,8 +253,8 @@ def two_bodies(seed: int, cycles: int, particles: int = 40) -> tuple[list[Run], 
 
 
 def solve_time(seed: int, cycles: int = 300) -> tuple[Array, Array]:
-    """Processor times s of ``cycles`` updates, about 100 particles in view and a map that has seen a revolution:
-    until the pose is out (cycles,), and of the learning after it (cycles,)."""
+    """Processor times s of ``cycles`` updates with about 100 particles in view and a map that has seen a
+    revolution: until the pose is out (cycles,), and of the learning after it (cycles,)."""
     run = follow(Scene().with_visible(100), seed, 100 + cycles)
     return np.array(run.seconds[100:]), np.array(run.learning[100:])
 
@@ -262,6 +278,7 @@ def figures(
         lambda: _precision(seeds),
         lambda: _bodies(seeds),
         lambda: _chained(seeds),
+        lambda: _small(seeds),
         lambda: _time(seeds),
     ]
     if optical_cycles:
@@ -413,7 +430,28 @@ def _chained(seeds: Sequence[int]) -> list[Figure]:
         settings = PoseSettings(reference=reference)
         ends = [follow(Scene(), seed, 161, settings).comparison().error[-20:, 5] for seed in seeds]
         last.append(float(np.sqrt(np.mean(np.square(ends)))))
-    return [_row("reference previous: psi error after two revolutions over that of map", last[0] / last[1])]
+    nees = np.mean([chained_nees(seed) for seed in range(1, 4 * len(seeds) + 1)])
+    return [
+        _row("reference previous: psi error after two revolutions over that of map", last[0] / last[1]),
+        _between("reference previous: NEES/6 from the first micrograph on", float(nees), 0.8, 1.3),
+    ]
+
+
+def _small(seeds: Sequence[int]) -> list[Figure]:
+    """Few particles, which tell little of the field error, and cannot average anything."""
+    rows = []
+    errors = Scene(field_error_xy=5e-9, field_error_z=30e-9)
+    for name, scene in (
+        ("field of 130 um, 25 visible", replace(errors, field=(130e-6, 130e-6)).with_visible(25)),
+        ("16 visible", errors.with_visible(16)),
+        ("9 visible", errors.with_visible(9)),
+    ):
+        comparisons = [follow(scene, seed, 160).comparison() for seed in seeds]
+        nees = float(np.mean([c.nees_per_dof for c in comparisons]))
+        rows.append(_between(f"{name}, field error 5, 30 nm: NEES/6", nees, 0.8, 1.3))
+        tilt = [((c.error / c.claimed)[:, 3:5] ** 2).mean() for c in comparisons]
+        rows.append(_between(f"{name}, field error 5, 30 nm: the same of the tilt", np.mean(tilt), 0.8, 1.3))
+    return rows
 
 
 def _time(seeds: Sequence[int]) -> list[Figure]:

@@ -67,7 +67,7 @@ class Stream:
         subscription = self._node.create_subscription(
             kind, topic, act, quality, callback_group=self._group, raw=raw
         )
-        self._subscriptions.append((subscription, act))
+        self._subscriptions.append((subscription, subscription.callback))  # refuses what act refuses
 
     def begin(self) -> None:
         """Take messages from now on."""

@@ -20,10 +20,12 @@ SCAN, RANGE, STEP = 6e-6, 4e-6, 0.25e-6
 
 
 def calibrate_simulated(
-    settings: SimulationSettings, progress: Callable[[int, int], None] = lambda done, total: None
+    settings: SimulationSettings,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    beads: int = 200,
 ) -> CalibrationResult:
-    """Calibrate the optics and camera of ``settings``. ``progress(done, total)`` counts planes; what it
-    raises ends the work."""
+    """Calibrate the optics and camera of ``settings``, with so many ``beads`` in view. ``progress(done,
+    total)`` counts planes; what it raises ends the work."""
     planes = round(2 * SCAN / STEP) + 1
     stacks = []
     for index, rotation in enumerate(ROTATIONS):
@@ -33,7 +35,7 @@ def calibrate_simulated(
 
         stacks.append(
             measure_stack(
-                focus_stack(settings, -SCAN, SCAN, STEP, substrate_rotation=rotation),
+                focus_stack(settings, -SCAN, SCAN, STEP, beads=beads, substrate_rotation=rotation),
                 camera_noise(settings),
                 DEFAULT_WEIGHTING,
                 DEFAULT_WINDOW_PX,

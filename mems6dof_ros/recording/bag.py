@@ -353,6 +353,10 @@ class BagReader:
         with _readable(self.path):
             self._reader = AnyReader([self.path], default_typestore=typestore())
             self._reader.open()
+            for connection in self._reader.connections:
+                found = connection.topic, connection.msgtype, connection.msgcount
+                if tuple(map(type, found)) != (str, str, int):
+                    raise TypeError(f"topic, type and count {found}")
 
     def __enter__(self) -> BagReader:
         return self

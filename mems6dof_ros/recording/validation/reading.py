@@ -40,32 +40,24 @@ Note = Callable[[], None]
 
 
 def read_bag(path: Path, note: Note) -> None:
-    """As check and frame_source do; where they refuse, again after recover."""
-    from mems6dof_ros.recording.recover import recover
-
-    try:
-        _read_bag(path, note)
-    except Mems6dofError as refused:
-        recover(path)
-        _read_bag(path, note)
-        raise refused
-
-
-def _read_bag(path: Path, note: Note) -> None:
+    """As check and frame_source do; where they refuse, check again after recover."""
     from mems6dof_ros.analysis.check import check_bag
     from mems6dof_ros.recording.bag import BagReader
+    from mems6dof_ros.recording.recover import recover
     from mems6dof_ros.sources.bag import BagSource
+    from mems6dof_ros.sources.source import frames
 
-    with BagReader(path) as bag:
-        for _ in bag.messages():
+    try:
+        check_bag(path)
+        for _ in frames(BagSource(path)):
             note()
-        bag.attachments(), bag.provenance()
-    check_bag(path)
-    source = BagSource(path)
-    source.start()
-    while source.read() is not None:
-        pass
-    source.stop()
+        with BagReader(path) as bag:
+            bag.attachments(), bag.provenance()
+    except Mems6dofError as refused:
+        recover(path)
+        if any(count for _, count in check_bag(path).topics.values()):
+            note()
+        raise refused
 
 
 def read_images(path: Path, note: Note) -> None:

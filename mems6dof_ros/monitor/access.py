@@ -72,7 +72,7 @@ def encryption(certificate: str, key: str) -> ssl.SSLContext | None:
         raise InputError(
             f"certificate {certificate}, key {key}",
             reason,
-            "PEM files that belong together, key not encrypted",
+            "PEM files that belong together, the key without password",
         ) from error
     return context
 

@@ -20,6 +20,7 @@ from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.monitor.access import is_loopback
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import InstrumentNode, run
+from mems6dof_ros.nodes.onlooker import give_way
 from mems6dof_ros.nodes.parameters import Parameter
 from mems6dof_ros.nodes.recorder import KNOWN_TYPES
 from mems6dof_ros.nodes.snapshots import Snapshots
@@ -106,6 +107,7 @@ class FoxgloveBridgeNode(InstrumentNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
+    give_way()
     return run(FoxgloveBridgeNode, args)
 
 

@@ -30,15 +30,15 @@ from std_srvs.srv import Trigger
 from mems6dof_msgs.msg import ControllerState, FrameInfo, GroundTruth, Localizations, Pose6DOF
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import GroundTruth as Truth
-from mems6dof_ros.monitor.feed import Feed
+from mems6dof_ros.monitor.feed import MAX_BODIES, Feed
 from mems6dof_ros.monitor.picture import make_picture
 from mems6dof_ros.monitor.server import MonitorServer
 from mems6dof_ros.monitor.truth import TruthAlignment
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.actuation import ANSWERS
 from mems6dof_ros.nodes.common import InstrumentNode, run
+from mems6dof_ros.nodes.onlooker import PolledSubscriptions, give_way
 from mems6dof_ros.nodes.parameters import Parameter
-from mems6dof_ros.nodes.polled import PolledSubscriptions
 from mems6dof_ros.nodes.scaled import ScaledCopies
 from mems6dof_ros.nodes.snapshots import Snapshots
 from mems6dof_ros.pose.cycle_pose import CyclePose
@@ -90,6 +90,7 @@ _RATES = (topics.FRAME_INFO, topics.LOCALIZATIONS, topics.POSE_6DOF)
 _MEMORY_FRAMES = 256  # frames whose messages are kept until the picture of one of them is made
 _TAKE_PERIOD = 0.04  # s; as often as a page is sent anything
 _STATE_PERIOD = 0.5  # s
+_BODIES_PERIOD = 2.0  # s
 _PICTURE_PATIENCE = 0.5  # s that a picture waits for its pose
 _STANDSTILL = 10.0  # s without a frame after which none are expected
 _NO_IMAGES = 3.0  # s without an image after which there are none
@@ -151,7 +152,8 @@ class MonitorNode(InstrumentNode):
         self.health.gauge("pages with pictures", lambda: self._feed.watchers)
 
     def activate(self) -> None:
-        polled = PolledSubscriptions(self, _TAKE_PERIOD)
+        self._polled = polled = PolledSubscriptions(self, _TAKE_PERIOD)
+        self._bodies: set[str] = set()  # with topics of their own
         # In the order in which a cycle comes about, so that everything is there when its pose comes.
         polled.subscribe(FrameInfo, topics.FRAME_INFO, self._on_frame_info)
         polled.subscribe(GroundTruth, topics.TRUTH, self._on_truth)
@@ -162,6 +164,7 @@ class MonitorNode(InstrumentNode):
         # Wall time: the page lives also while simulated time stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_STATE_PERIOD, self._tell_state, clock=steady)
+        self.create_timer(_BODIES_PERIOD, self._look_for_bodies, clock=steady)
         if rate := self.values["picture_rate"]:
             Snapshots(self, topics.IMAGE, rate, self._wants_image, self._images.put)
         if scale := self.values["viz_scale"]:
@@ -180,14 +183,39 @@ class MonitorNode(InstrumentNode):
 
     def _on_pose(self, data: bytes) -> None:
         self._counts[topics.POSE_6DOF] += 1
+        if pose := self._add_pose(deserialize_message(data, Pose6DOF)):
+            self._newest, self._newest_at = pose, time.monotonic()
+
+    def _add_pose(self, message: Pose6DOF) -> CyclePose | None:
         try:
-            pose = messages.to_cycle_pose(deserialize_message(data, Pose6DOF))
+            pose = messages.to_cycle_pose(message)
         except InputError as error:
             self._feed.tell("warning", str(error))
-            return
+            return None
         self._feed.add_pose(pose, self._true_displacement(pose))
         self._poses.setdefault(pose.stamp_ns, []).append(pose)
-        self._newest, self._newest_at = pose, time.monotonic()
+        return pose
+
+    def _look_for_bodies(self) -> None:
+        """Subscribe to what further bodies publish below their own names."""
+        first = self.resolve_topic_name(topics.POSE_6DOF)
+        base = first.removesuffix(topics.POSE_6DOF)
+        for name, _ in self.get_topic_names_and_types():
+            body, _, topic = name.removeprefix(base).partition("/")
+            further = name.startswith(base) and topic == topics.POSE_6DOF and body not in self._bodies
+            if further and len(self._bodies) < MAX_BODIES:
+                self._bodies.add(body)
+                self._follow_body(body)
+
+    def _follow_body(self, body: str) -> None:
+        def on_pose(data: bytes) -> None:
+            message = deserialize_message(data, Pose6DOF)
+            if message.body == body:
+                self._add_pose(message)
+            else:  # not a body of ours, but another instrument in a namespace below
+                end()
+
+        end = self._polled.subscribe(Pose6DOF, topics.of_body(body, topics.POSE_6DOF), on_pose)
 
     def _on_localizations(self, data: bytes) -> None:
         self._counts[topics.LOCALIZATIONS] += 1
@@ -360,6 +388,7 @@ def _finite(value: float) -> float | None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
+    give_way()
     return run(MonitorNode, args)
 
 

@@ -14,7 +14,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.polled import PolledSubscriptions
+from mems6dof_ros.nodes.onlooker import PolledSubscriptions
 from mems6dof_ros.recording import topics
 
 POSE = "viz/pose"

@@ -85,7 +85,7 @@ class Instrument:
     @property
     def url(self) -> str:
         """Address of the page, once the node has told it."""
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while time.monotonic() < deadline and self.monitor.poll() is None:
             for line in list(self.lines):
                 if self._says in line:
@@ -97,9 +97,9 @@ class Instrument:
         """End both; returns the exit status of the monitor."""
         if self.machine:
             self.machine.terminate()
-            self.machine.wait(10)
+            self.machine.wait(60)
         if self.monitor.poll() is None:
             self.monitor.send_signal(signal.SIGINT)
-        status = self.monitor.wait(10)
+        status = self.monitor.wait(60)
         self._resources.close()
         return status

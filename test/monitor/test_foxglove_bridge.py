@@ -97,7 +97,7 @@ def test_a_taken_port_is_one_line(bridge):
         machine_args=None,
         module="mems6dof_ros.nodes.foxglove_bridge",
     )
-    assert second.monitor.wait(20) == 1
+    assert second.monitor.wait(60) == 1
     second.stop()
     assert len([line for line in second.lines if line.startswith("error: ") and port in line]) == 1
 

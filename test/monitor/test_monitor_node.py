@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+from dataclasses import replace
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -19,11 +20,12 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from mems6dof_msgs.msg import ControllerState
+from mems6dof_msgs.msg import ControllerState, Pose6DOF
 from mems6dof_ros.monitor.history import COLUMNS
 from mems6dof_ros.monitor.synthetic import Machine
 from mems6dof_ros.nodes.actuation import ANSWERS
 from mems6dof_ros.nodes.localizer import point_cloud
+from mems6dof_ros.recording import messages
 
 COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 
@@ -38,7 +40,7 @@ class Page:
         self.pictures: list[tuple[dict, bytes]] = []
         self.results: list[dict] = []
 
-    async def until(self, condition, timeout: float = 15.0) -> None:
+    async def until(self, condition, timeout: float = 60.0) -> None:
         """Take in messages until ``condition()``."""
 
         async def take() -> None:
@@ -208,6 +210,30 @@ def test_a_controller_is_shown_and_steered(start):
         peer.close()
 
 
+def test_further_bodies_are_shown_and_other_instruments_are_not(start):
+    watched = start("-p", "port:=0")
+    peer = Peer(watched.domain)
+    pose = Machine(seed=2).cycle(0, image=False)[2]
+    said = {"pose_6dof": "load_gear", "idler/pose_6dof": "idler", "left/pose_6dof": "load_gear"}
+
+    async def act(page: Page) -> None:
+        await page.until(lambda: "services" in page.state)
+        publishers = {topic: peer.node.create_publisher(Pose6DOF, topic, 10) for topic in said}
+        for topic, body in said.items():
+            peer.wait(lambda topic=topic: publishers[topic].get_subscription_count())
+            publishers[topic].publish(messages.to_rclpy(messages.pose6dof(replace(pose, body=body))))
+        await page.until(lambda: len(page.rows) >= 2)
+        peer.wait(lambda: not publishers["left/pose_6dof"].get_subscription_count())
+        await page.until(lambda: len(page.state["bodies"]) == 2)
+        assert {body["name"] for body in page.state["bodies"]} == {"load_gear", "idler"}
+        assert sorted(page.rows[:, COLUMN["body"]]) == [0, 1]
+
+    try:
+        with_page(watched, act)
+    finally:
+        peer.close()
+
+
 def test_enlarged_copies_are_published_where_asked_for_and_only_there(start):
     plain, enlarging = start("-p", "port:=0"), start("-p", "port:=0", "-p", "viz_scale:=1000.0")
     assert plain.url
@@ -262,7 +288,7 @@ def test_the_node_ends_in_good_order_and_refuses_bad_parameters(instrument):
     assert not any("Traceback" in line for line in instrument.lines)
     for parameter in ("port:=70000", "history:=5", "colour:=red"):
         refused = Instrument("-p", parameter, machine_args=None)
-        assert refused.monitor.wait(20) == 1
+        assert refused.monitor.wait(60) == 1
         refused.stop()
         errors = [line for line in refused.lines if line.startswith("error: ")]
         assert len(errors) == 1

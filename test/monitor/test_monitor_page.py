@@ -74,7 +74,7 @@ def length(page) -> int:
 
 
 def wait_for_cycles(page, count: int) -> None:
-    page.wait_for_function("count => (mems6dof.view.history?.length ?? 0) >= count", arg=count, timeout=20000)
+    page.wait_for_function("count => (mems6dof.view.history?.length ?? 0) >= count", arg=count, timeout=60000)
 
 
 def wait_for_text(page, element: str, text: str) -> None:
@@ -105,7 +105,7 @@ def test_page_loads_in_two_seconds_and_moves(instrument, open_page):
         page.wait_for_function(
             "([selector, before]) => document.querySelector(selector).toDataURL() !== before",
             arg=[selector, before],
-            timeout=5000,
+            timeout=30000,
         )
     cycle = int(page.inner_text("#figure-cycle"))
     page.wait_for_function("cycle => +document.getElementById('figure-cycle').textContent > cycle", arg=cycle)
@@ -209,7 +209,7 @@ def test_limits_raise_alarms(instrument, open_page):
     page.fill("#limit-low", "-0.001")
     page.fill("#limit-high", "0,001")  # nm; a comma will do
     page.click("#limit-form button")
-    page.wait_for_selector("#alarm-chip:visible", timeout=5000)
+    page.wait_for_selector("#alarm-chip:visible", timeout=30000)
     wait_for_text(page, "limits", "outside")
     assert "dz = " in page.inner_text("#events")
     page.click("#limits button")
@@ -237,7 +237,7 @@ def test_page_comes_back_by_itself(serve, open_page, machine):
     wait_for_cycles(page, 10)
     page.evaluate("() => { mems6dof.link.socket.close(); }")
     page.wait_for_selector("#offline:visible")
-    page.wait_for_selector("#offline", state="hidden", timeout=5000)
+    page.wait_for_selector("#offline", state="hidden", timeout=30000)
     wait_for_cycles(page, 10)
     assert length(page) == 10  # and nothing twice
 

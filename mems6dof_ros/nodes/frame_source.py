@@ -340,16 +340,21 @@ class FrameSourceNode(InstrumentNode):
 
     def _publish(self, frame: Frame, published_ns: int | None = None) -> None:
         """Publish; ``published_ns``: when it was made known already, host clock."""
-        # The message is made before the clock of the latency runs, and only for somebody.
-        images = self._topics[topics.IMAGE]
-        image = messages.to_rclpy(messages.image(frame)) if images.get_subscription_count() else None
+        # Messages are made only for somebody, and most of them before the clock of the latency runs.
+        made = [
+            (self._topics[topic], messages.to_rclpy(message))
+            for topic, several in (
+                (topics.TRUTH, messages.ground_truths),
+                (topics.CAMERA_INFO, lambda frame: [messages.camera_info(frame)]),
+                (topics.IMAGE, lambda frame: [messages.image(frame)]),
+            )
+            if self._topics[topic].get_subscription_count()
+            for message in several(frame)
+        ]
         frame = replace(frame, published_ns=published_ns or time.time_ns())
         self._topics[topics.FRAME_INFO].publish(messages.to_rclpy(messages.frame_info(frame)))
-        for truth in messages.ground_truths(frame):
-            self._topics[topics.TRUTH].publish(messages.to_rclpy(truth))
-        self._topics[topics.CAMERA_INFO].publish(messages.to_rclpy(messages.camera_info(frame)))
-        if image is not None:
-            images.publish(image)
+        for publisher, message in made:
+            publisher.publish(message)
         self.health.count("frames")
         if frame.frames_dropped:
             self.health.lost(frame.frames_dropped, f"the source lost {frame.frames_dropped} frames")

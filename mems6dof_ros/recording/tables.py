@@ -39,25 +39,25 @@ class Table:
     row: Callable[[Any], Sequence[Any]]
 
 
-@dataclass(frozen=True)
-class Sighting:
-    """One row of the localizations: element ``index`` of ``found``, used for the pose of ``body``."""
-
-    found: Localizations
-    index: int
-    body: str
-    particle_id: int
-    residual: NDArray[np.float64]
-
-
-def sightings(found: Localizations, poses: Sequence[CyclePose]) -> list[Sighting]:
-    """Rows for all localizations of a frame, with their part in the pose of whichever body used them."""
-    unused = np.full(3, np.nan)
-    rows = [Sighting(found, i, "", -1, unused) for i in range(len(found))]
+def sightings(found: Localizations, poses: Sequence[CyclePose]) -> list[list[Any]]:
+    """Rows of LOCALIZATIONS for all of a frame, with their part in the pose of whichever body used them."""
+    count, fits = len(found), found.fits
+    body, particle_id, residual = [""] * count, np.full(count, -1), np.full((count, 3), np.nan)
     for pose in poses:
-        for i in np.flatnonzero(pose.particle_id >= 0):
-            rows[i] = Sighting(found, int(i), pose.body, int(pose.particle_id[i]), pose.residual[i])
-    return rows
+        used = np.flatnonzero(pose.particle_id >= 0)
+        particle_id[used], residual[used] = pose.particle_id[used], pose.residual[used]
+        for i in used:
+            body[i] = pose.body
+    upper = found.covariance.reshape(count, 9)[:, [0, 1, 2, 4, 5, 8]]
+    quality = np.stack([fits.flux, fits.chi_square, found.z_gap], axis=1)
+    # Lists of Python's own numbers: a hundred rows in a motion cycle are to be written.
+    measured = np.concatenate([found.position, upper, fits.parameters, quality], axis=1).tolist()
+    first = [found.cycle, found.frame_counter, found.stamp_ns]
+    judged = zip(found.flags.tolist(), body, particle_id.tolist(), residual.tolist(), strict=True)
+    return [
+        [*first, i, *numbers, flags, name, identity, *left]
+        for i, (numbers, (flags, name, identity, left)) in enumerate(zip(measured, judged, strict=True))
+    ]
 
 
 def _columns(*groups: tuple[type, str]) -> dict[str, type]:
@@ -117,22 +117,6 @@ CYCLES = Table(
 )
 
 
-_UPPER = np.triu_indices(3)
-
-
-def _sighting_row(sighting: Sighting) -> list[Any]:
-    found, i = sighting.found, sighting.index
-    return [
-        *(found.cycle, found.frame_counter, found.stamp_ns, i),
-        *found.position[i],
-        *found.covariance[i][_UPPER],
-        *found.fits.parameters[i],
-        *(found.fits.flux[i], found.fits.chi_square[i], found.z_gap[i]),
-        *(found.flags[i], sighting.body, sighting.particle_id),
-        *sighting.residual,
-    ]
-
-
 #: One row per localization: what Localizations says, and the body and particle it was taken for.
 LOCALIZATIONS = Table(
     "localizations",
@@ -146,7 +130,7 @@ LOCALIZATIONS = Table(
         (int, "particle_id"),
         (float, "residual_x_m residual_y_m residual_z_m"),
     ),
-    _sighting_row,
+    list,
 )
 
 
@@ -218,7 +202,12 @@ class TableWriter:
         """Append the row of one object of the table's kind."""
         kinds = self._table.columns.values()
         values = self._table.row(row)
-        self._writer.writerow([_text(kind, value) for kind, value in zip(kinds, values, strict=True)])
+        self._writer.writerow(
+            [
+                repr(value) if type(value) is float else _text(kind, value)
+                for kind, value in zip(kinds, values, strict=True)
+            ]
+        )
 
     def flush(self) -> None:
         """Hand everything to the operating system."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from mems6dof_ros.calibration.calibrate import CalibrationResult, CalibrationSettings, calibrate
 from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, measure_stack
@@ -23,9 +24,10 @@ def calibrate_simulated(
     settings: SimulationSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
     beads: int = 200,
+    psf: bool = False,
 ) -> CalibrationResult:
-    """Calibrate the optics and camera of ``settings``, with so many ``beads`` in view. ``progress(done,
-    total)`` counts planes; what it raises ends the work."""
+    """Calibrate the optics and camera of ``settings``, with so many ``beads`` in view, with ``psf`` also what
+    method psf needs. ``progress(done, total)`` counts planes; what it raises ends the work."""
     planes = round(2 * SCAN / STEP) + 1
     stacks = []
     for index, rotation in enumerate(ROTATIONS):
@@ -43,4 +45,12 @@ def calibrate_simulated(
                 counted,
             )
         )
-    return calibrate(stacks, CalibrationSettings(axial_range=RANGE, rotations=ROTATIONS))
+    wanted = CalibrationSettings(axial_range=RANGE, rotations=ROTATIONS)
+    if psf:
+        wanted = replace(
+            wanted,
+            numerical_aperture=settings.numerical_aperture,
+            wavelength=settings.wavelength,
+            bead_diameter=settings.diameter,
+        )
+    return calibrate(stacks, wanted)

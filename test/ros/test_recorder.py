@@ -20,6 +20,8 @@ from std_srvs.srv import Trigger
 from mems6dof_msgs.msg import Pose6DOF
 from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.recording.bag import BagReader
+from mems6dof_ros.recording.validation.crash import die
+from mems6dof_ros.recording.validation.processes import traffic, witnessed_recorder
 
 Start = Callable[..., NodeProcess]
 
@@ -135,3 +137,41 @@ def test_a_full_disk_ends_the_record_and_says_so(start: Start, peer: Peer, small
     assert peer.call(Trigger, "recorder/stop").success
     assert check_bag(small_disk / "bag_1").topics["/pose_6dof"] == ("mems6dof_msgs/msg/Pose6DOF", 1)
     assert node.stop() == 0
+
+
+def test_a_killed_recorder_loses_one_cycle_at_most(domain: int, tmp_path: Path) -> None:
+    for death in die(tmp_path / "killed", seed=1, kills=3, size=64, rate=100.0):
+        assert death.written > 20
+        assert death.must >= death.written - 12  # of four messages a cycle, and a file may just have ended
+        assert death.written >= death.after == death.indexed >= death.must
+        assert death.before >= death.must
+
+
+def test_a_slow_disk_loses_what_it_counts(peer: Peer, tmp_path: Path) -> None:
+    """A frame of 131 kB takes the disk 0.13 s; 50 come in a second, of which 1 MiB waits."""
+    peer.listen(DiagnosticArray, "/diagnostics")
+
+    def latest(what: str) -> int:
+        found = [s for m in peer.received["/diagnostics"] for s in m.status if s.name == "lab/recorder"]
+        values = {v.key: v.value for v in found[-1].values} if found else {}
+        return int(values.get(what, 0))
+
+    output = tmp_path / "bag"
+    with (
+        traffic("lab", 50.0, 256),
+        witnessed_recorder("lab", output, tmp_path / "journal", rate=1e6, queue_mebibytes=1),
+    ):
+        peer.wait(lambda: latest("lost") > 50)
+        answer = peer.call(Trigger, "/lab/recorder/stop")
+        assert answer.success
+        seen = len(peer.received["/diagnostics"])
+        peer.wait(lambda: len(peer.received["/diagnostics"]) > seen + 6)
+        messages, lost = latest("messages"), latest("lost")
+    warned = [
+        s for m in peer.received["/diagnostics"] for s in m.status if "the disk does not keep up" in s.message
+    ]
+    assert warned
+    assert all(status.level == DiagnosticStatus.WARN for status in warned)
+    with BagReader(output) as bag:
+        assert sum(bag.counts.values()) == messages - lost
+        assert sum(1 for _ in bag.messages()) == messages - lost

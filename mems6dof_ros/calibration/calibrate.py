@@ -27,7 +27,13 @@ from mems6dof_ros.calibration.model_fit import (
     fit_model,
     sharpest_stage,
 )
-from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, features, field_position
+from mems6dof_ros.calibration.optical_model import (
+    FEATURES,
+    FieldMap,
+    features,
+    field_position,
+    fit_field_map,
+)
 from mems6dof_ros.calibration.psf_fit import Retrieval
 from mems6dof_ros.calibration.psf_model import PsfBead, PsfModel, fit_psf
 from mems6dof_ros.calibration.psf_pupil import Imaging
@@ -40,6 +46,8 @@ OUTLIER = 8.0
 BRIGHTNESS_FACTOR = 30.0
 #: Below this number of beads the scatter between particles is poorly known.
 FEW_BEADS = 10
+#: Field orders of the illumination map.
+ILLUMINATION_ORDERS = (0, 2, 3)
 #: Departure of images from the pupil model, relative to their light, that deserves a warning.
 PSF_MISFIT = 0.05
 
@@ -116,15 +124,16 @@ def calibrate(
             )
         beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
     chosen = [bead for _, bead in beads]
+    illumination = _illumination(chosen, curves, radius)
     psf, pupils = _fit_psf(chosen, curves, fit, settings, first.pixel_size, progress)
     calibration = Calibration(
-        fit.model,
+        replace(fit.model, illumination=illumination),
         first.pixel_size,
         first.image_size,
         first.weighting,
         first.window_px,
         first.camera,
-        _valid_range(chosen, curves, interval, first, settings.axial_range),
+        _valid_range(chosen, curves, interval, first, settings.axial_range, illumination),
         provenance=_provenance(stacks, settings, fit, len(beads), len(rejected)),
         psf=psf,
     )
@@ -144,6 +153,15 @@ def calibrate(
         tuple(warnings),
         tuple(pupils),
     )
+
+
+def _illumination(beads: Sequence[BeadStack], curves: Sequence[BeadCurve], radius: float) -> FieldMap:
+    """ln of the beads' light in focus over the field, zero on the axis: what the illumination makes of beads
+    that are alike on average."""
+    x, y = (np.array([getattr(curve, axis) for curve in curves]) for axis in "xy")
+    found, _ = fit_field_map(radius, x, y, np.log([bead.flux for bead in beads]), ILLUMINATION_ORDERS)
+    on_axis = found(np.zeros(1), np.zeros(1))[0]
+    return FieldMap(radius, found.coefficients - on_axis * (np.arange(len(found.coefficients)) == 0))
 
 
 def _fit_psf(
@@ -236,6 +254,7 @@ def _valid_range(
     interval: tuple[float, float],
     first: FocusStack,
     limit: float | None,
+    illumination: FieldMap,
 ) -> ValidRange:
     """Half a bead distance beyond the outermost beads, inside the image; the whole image for few beads."""
     half = [(n - 1) / 2 * first.pixel_size for n in first.image_size]
@@ -246,10 +265,13 @@ def _valid_range(
             half, ([curve.x for curve in curves], [curve.y for curve in curves]), strict=True
         )
     )
-    flux = [bead.flux for bead in beads]
+    x_bead, y_bead = (np.array([getattr(curve, axis) for curve in curves]) for axis in "xy")
+    flux = np.array([bead.flux for bead in beads]) / np.exp(illumination(x_bead, y_bead))
     if limit is not None:
         interval = (max(interval[0], -limit), min(interval[1], limit))
-    return ValidRange(interval, x, y, (min(flux) / BRIGHTNESS_FACTOR, max(flux) * BRIGHTNESS_FACTOR))
+    return ValidRange(
+        interval, x, y, (float(flux.min()) / BRIGHTNESS_FACTOR, float(flux.max()) * BRIGHTNESS_FACTOR)
+    )
 
 
 def _warnings(

@@ -129,23 +129,19 @@ class Calibration:
         ``image`` (height, width) ADU, in which they were fitted: method joint reads from it what the
         Gaussians leave over, and is less precise without; method psf raises InputError without.
         """
-        if self.method == "rho_amp":
-            found = _guarded(self._by_amplitude.locate(fits), self._by_shape.locate(fits))
-        elif image is None:
-            if self.method == "psf":
+        moments = None if image is None else residual_moments(image, fits, self.camera, self.window_px)
+        if self.method == "psf":
+            if image is None or moments is None:
                 raise InputError("calibration method", "'psf' without an image", "the image of the fits")
-            found = self._by_shape.locate(fits)
+            found = self._by_pixels.locate(fits, moments, image)
         else:
-            moments = residual_moments(image, fits, self.camera, self.window_px)
-            found = (
-                self._by_pixels.locate(fits, moments, image)
-                if self.method == "psf"
-                else self._by_all_features.locate(fits, moments)
-            )
+            found = (self._by_shape if moments is None else self._by_all_features).locate(fits, moments)
+            if self.method == "rho_amp":
+                found = _guarded(self._by_amplitude.locate(fits), found)
         x, y = field_position(fits.parameters, self.pixel_size, self.image_size)
         with np.errstate(invalid="ignore"):
             outside = _outside(x, self.valid.x) | _outside(y, self.valid.y)
-            brightness = _outside(fits.flux, self.valid.flux)
+            brightness = _outside(self.model.brightness(fits, x, y), self.valid.flux)
         flags = np.where(outside, Flag.OUT_OF_FIELD, 0) | np.where(brightness, Flag.OUT_OF_BRIGHTNESS, 0)
         position = self.correction.apply(found.position) if self.correction else found.position
         return replace(found, position=position, flags=found.flags | flags.astype(np.uint32))
@@ -177,7 +173,7 @@ class Calibration:
 
 
 def _guarded(found: Positions, shape: Positions) -> Positions:
-    """Flag as ambiguous what the ``shape`` places on another branch: one feature alone cannot tell."""
+    """Flag as ambiguous what all features of the ``shape`` place on another branch: one alone cannot tell."""
     difference = np.abs(found.position[:, 2] - shape.position[:, 2])
     variance = found.covariance[:, 2, 2] + shape.covariance[:, 2, 2]
     with np.errstate(invalid="ignore"):
@@ -265,6 +261,8 @@ def _content(calibration: Calibration) -> dict[str, Any]:
 
 def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
     model, camera, valid = calibration.model, calibration.camera, calibration.valid
+    light = model.illumination
+    illumination = {} if light is None else {"ln_illumination": light.coefficients.tolist()}
     psf = {} if calibration.psf is None else {"psf": psf_model.content(calibration.psf)}
     return {
         "optics": {
@@ -294,6 +292,7 @@ def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
             "ln_reference_amplitude_per_flux": model.reference.coefficients.tolist(),
             "scatter_defocus_m": model.nodes.tolist(),
             "scatter_covariance": model.scatter.tolist(),
+            **illumination,
         },
         **psf,
     }
@@ -367,6 +366,7 @@ def _read_version_1(fields: _Fields) -> Calibration:
             nodes,
             model.array("scatter_covariance", len(nodes), count, count),
             model.number("focus_variance_m2"),
+            FieldMap(radius, model.array("ln_illumination", -1)) if "ln_illumination" in model else None,
         ),
         pixel_size=optics.number("pixel_size_m"),
         image_size=(int(width), int(height)),

@@ -307,9 +307,13 @@ def _bead(fits: Sequence[GaussianFits], moments: Sequence[Moments], stage_z: Arr
 
 
 def _windows(planes: Sequence[Frame], camera: CameraNoise, bead: BeadStack, window_px: int) -> BeadWindows:
-    """The same window of every plane, in electrons, about the bead in focus."""
-    column, row = np.rint(bead.fits.parameters[bead.in_focus, :2]).astype(int) - window_px // 2
+    """The same window of every plane, in electrons, about the bead in focus or as near as the edge allows."""
+    height, width = planes[0].image.shape
+    corner = np.rint(bead.fits.parameters[bead.in_focus, :2]).astype(int) - window_px // 2
+    column, row = np.clip(corner, 0, [width - window_px, height - window_px])
     cut = np.s_[row : row + window_px, column : column + window_px]
     offset, gain, read_variance = (values[cut] if values.size > 1 else values for values in camera.maps)
-    electrons = np.array([(plane.image[cut] - offset) / gain for plane in planes], dtype=np.float32)
-    return BeadWindows((int(column), int(row)), bead.stage_z, electrons, float(np.mean(read_variance)))
+    electrons = np.array([(plane.image[cut].astype(np.float64) - offset) / gain for plane in planes])
+    return BeadWindows(
+        (int(column), int(row)), bead.stage_z, electrons.astype(np.float32), float(np.mean(read_variance))
+    )

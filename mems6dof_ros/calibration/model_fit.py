@@ -33,6 +33,7 @@ _FOLDS = 10
 _NODES = 41
 _ROUNDS = 3
 _MANY_BEADS = 20
+_LEAST_RESIDUALS = 4.0
 #: A plane of a bead is left out where its residual exceeds the median one by this factor (7 sigma).
 _OUTLIER = 10.0
 #: Rotation of the features into those that scatter independently: size and elongation, not two widths.
@@ -384,7 +385,9 @@ def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Arra
         mean = np.einsum("n,nkl->kl", weight, excess) / max(weight.sum(), 1e-12)
         modes = _MODES @ mean @ _MODES.T
         modes = (1 - apart) * modes + apart * np.diag(np.diag(modes))
-        found[index] = _positive(_MODES.T @ modes @ _MODES)
+        # A variance known from few residuals: what is measured next follows Student's distribution.
+        count = max(weight.sum() ** 2 / max(np.sum(weight**2), 1e-12), _LEAST_RESIDUALS)
+        found[index] = count / (count - 2) * _positive(_MODES.T @ modes @ _MODES)
     return found
 
 

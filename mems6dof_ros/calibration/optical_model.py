@@ -12,6 +12,7 @@ surface f holds field curvature and tilt, zero on the axis.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ from mems6dof_ros.localization.localizations import GaussianFits
 #: Order of the features everywhere in this room.
 FEATURES = ("dx", "dy", "ln_sigma_x", "ln_sigma_y", "atanh_rho", "rho_amp", *MOMENTS)
 _FITTED = len(FEATURES) - len(MOMENTS)
+_BETTER = 0.98  # of a score, before a higher order is taken
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,26 @@ class FieldMap:
         return zernike(order, x / self.radius, y / self.radius) @ self.coefficients
 
 
+def fit_field_map(
+    radius: float, x: Array, y: Array, values: Array, orders: Sequence[int]
+) -> tuple[FieldMap, Array]:
+    """Map of ``values`` (b,) measured at ``x``, ``y`` (b,) m, of the lowest of ``orders`` that predicts
+    values left out as well as any, and how far each value lies from what the others predict (b,)."""
+    best: tuple[float, Array, Array] | None = None
+    for order in orders:
+        design = zernike(order, x / radius, y / radius)
+        if best is not None and design.shape[1] > len(values) / 2:
+            break
+        inverse = np.linalg.pinv(design)
+        leverage = np.einsum("bj,jb->b", design, inverse)
+        left_out = (values - design @ (inverse @ values)) / np.maximum(1 - leverage, 1e-3)
+        score = float(np.mean(left_out**2))
+        if best is None or score < _BETTER * best[0]:
+            best = score, inverse @ values, left_out
+    assert best is not None
+    return FieldMap(radius, best[1]), best[2]
+
+
 @dataclass(frozen=True)
 class OpticalModel:
     """``curves`` of the FEATURES over defocus u (m) and field; ``focus`` f(X, Y) in m; ``reference``, the
@@ -46,6 +68,8 @@ class OpticalModel:
 
     ``nodes`` (g,) m: defocus at which ``scatter`` (g, k, k) gives the covariance of the particles'
     features about the model, fit noise excluded. ``focus_variance`` m^2: of the focus surface.
+    ``illumination``: natural logarithm of the brightness over the field relative to the axis; None in
+    files written before it was measured.
     """
 
     curves: FieldCurves
@@ -54,6 +78,11 @@ class OpticalModel:
     nodes: Array
     scatter: Array
     focus_variance: float
+    illumination: FieldMap | None = None
+
+    def brightness(self, fits: GaussianFits, x: Array, y: Array) -> Array:
+        """Electrons (n,) that the particles of ``fits`` at ``x``, ``y`` (n,) m would show on the axis."""
+        return fits.flux if self.illumination is None else fits.flux / np.exp(self.illumination(x, y))
 
     def scatter_at(self, u: Array) -> Array:
         """``scatter`` interpolated linearly at defocus ``u`` (n,): (n, k, k)."""

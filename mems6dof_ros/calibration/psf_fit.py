@@ -90,7 +90,8 @@ def retrieve(windows: BeadWindows, pupil: PupilImages, start: Array, centre: Arr
             damping = max(10 * damping, 1e-6)
             if damping > 1e6:
                 break
-    return Retrieval(parameters, np.linalg.inv(normal + np.diag(precision)), misfit)
+    covariance = np.asarray(np.linalg.inv(normal + np.diag(precision)), dtype=np.float64)
+    return Retrieval(parameters, covariance, misfit)
 
 
 class _Objective:

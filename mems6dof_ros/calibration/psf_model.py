@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mems6dof_ros.calibration.field_curves import Array
-from mems6dof_ros.calibration.optical_model import FieldMap
+from mems6dof_ros.calibration.optical_model import FieldMap, fit_field_map
 from mems6dof_ros.calibration.psf_fit import (
     COUNT,
     DIAMETER,
@@ -27,7 +27,7 @@ from mems6dof_ros.calibration.psf_fit import (
     retrieve,
 )
 from mems6dof_ros.calibration.psf_pupil import PUPIL_TERMS, Imaging, PupilImages
-from mems6dof_ros.calibration.zernike import zernike, zernike_count
+from mems6dof_ros.calibration.zernike import zernike, zernike_order
 
 #: Field orders that cross-validation chooses from, for every coefficient by itself.
 FIELD_ORDERS = (0, 1, 2, 3, 4)
@@ -42,11 +42,11 @@ class PsfModel:
     """The pupil over the field and the scatter of particles about it.
 
     ``wavefront`` (terms, Zernike terms of the field) waves rms, in the order of PUPIL_TERMS; ``slope``
-    (2, Zernike terms) rad of the chief ray; both on a disc of ``radius`` m, filled up with zeros where a term
-    needs a lower order. ``ln_diameter``: of the mean diameter over the nominal one. ``focus``: z of zero defocus,
-    ``focus_variance`` m^2. ``scatter`` (terms + 1, terms + 1): covariance of single particles' coefficients
-    and ln diameter. ``interval`` m: defocus that the beads covered. ``misfit``: rms of what the beads' images
-    differ from the model beyond noise, relative to their light.
+    (2, Zernike terms) rad of the chief ray; both on a disc of ``radius`` m, filled up with zeros where a
+    term needs a lower order. ``ln_diameter``: of the mean diameter over the nominal one. ``focus``: z of
+    zero defocus, ``focus_variance`` m^2. ``scatter`` (terms + 1, terms + 1): covariance of single particles'
+    coefficients and ln diameter. ``interval`` m: defocus that the beads covered. ``misfit``: rms of what the
+    beads' images differ from the model beyond noise, relative to their light.
     """
 
     imaging: Imaging
@@ -62,8 +62,7 @@ class PsfModel:
 
     def at(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Wavefronts (n, terms) waves and chief-ray slopes (n, 2) rad at field positions (n,) m."""
-        count = self.wavefront.shape[1]
-        order = next(order for order in range(count) if zernike_count(order) == count)
+        order = zernike_order(self.wavefront.shape[1])
         terms = zernike(order, x / self.radius, y / self.radius)
         return terms @ self.wavefront.T, terms @ self.slope.T
 
@@ -133,9 +132,10 @@ def _model(
     values = np.array([r.parameters for r in found])
     noise = np.mean([r.covariance for r in found], axis=0)
     beads = len(values)
-    fitted = [_smooth(places / radius, values[:, k]) for k in range(SLOPE.start, DIAMETER)]
-    terms = max(len(coefficients) for coefficients, _ in fitted)
-    field = np.array([np.pad(c, (0, terms - len(c))) for c, _ in fitted])
+    x, y = places.T
+    fitted = [fit_field_map(radius, x, y, values[:, k], FIELD_ORDERS) for k in range(SLOPE.start, DIAMETER)]
+    terms = max(len(field_map.coefficients) for field_map, _ in fitted)
+    field = np.array([np.pad(m.coefficients, (0, terms - len(m.coefficients))) for m, _ in fitted])
     slopes = SLOPE.stop - SLOPE.start
     mean_diameter = float(np.mean(values[:, DIAMETER]))
     # Own departures, as large as they would be had the bead not taken part, and as uncertain as the
@@ -149,7 +149,7 @@ def _model(
     scatter = (1 - apart) * scatter + apart * np.diag(np.diag(scatter))
     stages = values[:, STAGE] * 1e-6
     surface, variance = focus(stages)
-    piston = float(np.mean(heights - stages - surface(*places.T)))
+    piston = float(np.mean(heights - stages - surface(x, y)))
     coefficients = surface.coefficients.copy()
     coefficients[0] += piston
     return PsfModel(
@@ -164,24 +164,6 @@ def _model(
         (interval[0] - piston, interval[1] - piston),
         float(np.sqrt(np.mean([r.misfit**2 for r in found]))),
     )
-
-
-def _smooth(places: Array, values: Array) -> tuple[Array, Array]:
-    """Zernike coefficients of ``values`` (b,) at ``places`` (b, 2) of the order that predicts beads left out
-    best, and how far each bead lies from what the others predict (b,)."""
-    best: tuple[float, Array, Array] | None = None
-    for order in FIELD_ORDERS:
-        design = zernike(order, *places.T)
-        if order > 0 and design.shape[1] > len(values) / 2:
-            break
-        inverse = np.linalg.pinv(design)
-        leverage = np.einsum("bj,jb->b", design, inverse)
-        left_out = (values - design @ (inverse @ values)) / np.maximum(1 - leverage, 1e-3)
-        score = float(np.mean(left_out**2))
-        if best is None or score < 0.98 * best[0]:
-            best = score, inverse @ values, left_out
-    assert best is not None
-    return best[1], best[2]
 
 
 def _positive(matrix: Array) -> Array:

@@ -171,8 +171,9 @@ class PupilImages:
             padded = np.zeros((*spectra.shape[:-2], side, side // 2 + 1), np.complex64)
             padded[..., :half, : half + 1] = spectra[..., :half, :]
             padded[..., -half:, : half + 1] = spectra[..., half:, :]
-            spectra = padded * np.float32((side / coarse) ** 2)
-        return np.asarray(scipy.fft.irfft2(spectra, s=(side, side)), dtype=np.float64)
+            padded *= np.float32((side / coarse) ** 2)
+            return np.asarray(scipy.fft.irfft2(padded), dtype=np.float64)
+        return np.asarray(scipy.fft.irfft2(spectra), dtype=np.float64)
 
     def _field(self, pupil: NDArray[np.complex64]) -> NDArray[np.complex64]:
         n, side, _ = pupil.shape

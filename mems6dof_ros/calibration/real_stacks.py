@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +11,31 @@ from numpy.typing import NDArray
 
 from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
 from mems6dof_ros.calibration.field_curves import Array
+from mems6dof_ros.calibration.file import Calibration
 from mems6dof_ros.calibration.focus_stack import BeadStack, FocusStack, measure_stack
 from mems6dof_ros.calibration.model_fit import GROUPS, Orders
+from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
+from mems6dof_ros.localization.localizations import GaussianFits
 from mems6dof_ros.sources.source import frames, open_source
 
 
 @dataclass(frozen=True)
 class StageErrors:
     """z against the stage with each bead's own height taken off, where not flagged: ``error`` and claimed
-    ``sd`` (n,) m. ``flagged``: the fraction of planes left out for their flags."""
+    ``sd`` (n,) m. ``flagged``: the fraction of planes left out for their flags. ``common`` (n,) m: what the
+    other beads of the same image say of the stage, NaN where there are none."""
 
     error: Array
     sd: Array
     flagged: float
+    common: Array
+
+    @property
+    def apart(self) -> StageErrors:
+        """Errors apart from what is common to all beads of an image: errors of the stage, above all."""
+        return replace(self, error=self.error - self.common)
 
     @property
     def rms(self) -> float:
@@ -39,14 +50,22 @@ class StageErrors:
         return float(1 / np.sqrt(np.mean((self.error / self.sd) ** 2)))
 
 
-def astigmatic_stack(folder: Path, window_px: int = 31) -> FocusStack:
-    """11 beads, NA 0.85, astigmatic lens, 100 nm steps. The camera's numbers are unknown; photon transfer
-    between successive planes gives 0.115 ADU per electron and no offset."""
-    source = open_source(
-        "images", path=folder / "bead_stack_astigmatic_air085.tif", step=100e-9, pixel_size=63.5e-9
-    )
+def astigmatic_frames(folder: Path) -> list[Frame]:
+    """80 planes of 100 nm, 11 beads, NA 0.85, astigmatic lens."""
+    path = folder / "bead_stack_astigmatic_air085.tif"
+    return list(frames(open_source("images", path=path, step=100e-9, pixel_size=63.5e-9)))
+
+
+def astigmatic_stack(planes: Sequence[Frame], window_px: int = 25) -> FocusStack:
+    """The beads of ``astigmatic_frames``. The camera's numbers are unknown; photon transfer between
+    successive planes gives 0.115 ADU per electron and no offset. The background of 700 electrons per pixel
+    is uneven: a larger window sees more of it."""
     camera = CameraNoise(0.0, 0.115, 1.0, 255)
-    return measure_stack(frames(source), camera, DEFAULT_WEIGHTING, window_px, "astigmatic, real")
+    return measure_stack(planes, camera, DEFAULT_WEIGHTING, window_px, "astigmatic, real")
+
+
+#: Of the astigmatic stack: aperture and wavelength as published, diameter as it appears (fitted, once).
+ASTIGMATIC = CalibrationSettings(numerical_aperture=0.85, wavelength=520e-9, bead_diameter=350e-9)
 
 
 def intrinsic_stack(folder: Path, window_px: int = 31) -> FocusStack:
@@ -56,21 +75,66 @@ def intrinsic_stack(folder: Path, window_px: int = 31) -> FocusStack:
     return measure_stack(frames(source), camera, DEFAULT_WEIGHTING, window_px, "intrinsic, real")
 
 
-def one_bead_left_out(stack: FocusStack, reach: float, orders: Orders | None, method: str) -> StageErrors:
-    """Calibrate from all beads but one, measure that one within ``reach`` m of its focus, for every bead."""
-    error, sd, seen = [], [], 0
-    for index, bead in enumerate(stack.beads):
+def one_bead_left_out(
+    stack: FocusStack,
+    planes: Sequence[Frame],
+    reach: float,
+    settings: CalibrationSettings,
+    methods: Sequence[str],
+    beads: Sequence[int] | None = None,
+) -> dict[str, StageErrors]:
+    """Calibrate from all beads but one, measure that one within ``reach`` m of its focus, for every bead or
+    those of the numbers in ``beads``.
+
+    The others are measured as well: the median of their errors in an image is the stage's there.
+    """
+    found: dict[str, list[tuple[Array, Array, Array, NDArray[np.bool_]]]] = {name: [] for name in methods}
+    for index in range(len(stack.beads)) if beads is None else beads:
         others = replace(stack, beads=stack.beads[:index] + stack.beads[index + 1 :])
-        calibration = calibrate([others], CalibrationSettings(orders=orders)).calibration.with_method(method)
-        found = calibration.locate(bead.fits)
-        z = found.position[:, 2] + bead.stage_z
-        near = np.abs(bead.stage_z - bead.stage_z[bead.in_focus]) <= reach
-        seen += int(np.count_nonzero(near))
-        near &= found.flags == 0
-        error.append(z[near] - np.mean(z[near]) if near.any() else z[near])
-        sd.append(np.sqrt(found.covariance[near, 2, 2]))
-    errors = np.concatenate(error)
-    return StageErrors(errors, np.concatenate(sd), 1 - len(errors) / seen)
+        calibration = calibrate([others], settings).calibration
+        for name in methods:
+            z, sd, good = _through_focus(calibration.with_method(name), stack, planes, reach)
+            rest = np.arange(len(z)) != index
+            seen = np.isfinite(z[rest]).any(axis=0)
+            common = np.full(z.shape[1], np.nan)
+            common[seen] = np.nanmedian(z[rest][:, seen], axis=0)
+            here = np.isfinite(z[index]) & np.isfinite(common)
+            found[name].append((z[index, here], sd[index, here], common[here], good[index, here]))
+    results = {}
+    for name, parts in found.items():
+        error, sd, common, good = (np.concatenate(column) for column in zip(*parts, strict=True))
+        results[name] = StageErrors(error[good], sd[good], 1 - float(np.mean(good)), common[good])
+    return results
+
+
+def _through_focus(
+    calibration: Calibration, stack: FocusStack, planes: Sequence[Frame], reach: float
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """z against the stage of every bead in every plane (b, p) m about the bead's mean, NaN beyond ``reach``;
+    claimed sd; which have no flag."""
+    shape = len(stack.beads), len(planes)
+    z, sd, good = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+    for plane, frame in enumerate(planes):
+        at = [
+            (number, int(np.argmin(np.abs(bead.stage_z - frame.stage_z))))
+            for number, bead in enumerate(stack.beads)
+            if abs(frame.stage_z - bead.stage_z[bead.in_focus]) <= reach
+            and np.abs(bead.stage_z - frame.stage_z).min() < 1e-9
+        ]
+        if not at:
+            continue
+        beads = [number for number, _ in at]
+        fits = GaussianFits(
+            *(
+                np.array([getattr(stack.beads[number].fits, f.name)[k] for number, k in at])
+                for f in fields(GaussianFits)
+            )
+        )
+        found = calibration.locate(fits, frame.image)
+        z[beads, plane] = found.position[:, 2] + frame.stage_z
+        sd[beads, plane] = np.sqrt(found.covariance[:, 2, 2])
+        good[beads, plane] = found.flags == 0
+    return z - np.nanmean(np.where(good, z, np.nan), axis=1, keepdims=True), sd, good
 
 
 def one_plane_left_out(stack: FocusStack, reach: float, orders: Orders) -> StageErrors:
@@ -86,7 +150,7 @@ def one_plane_left_out(stack: FocusStack, reach: float, orders: Orders) -> Stage
         if found.flags[0] == 0:
             error.append(found.position[0, 2] + bead.stage_z[index] - result.fit.sharpest[0])
             sd.append(np.sqrt(found.covariance[0, 2, 2]))
-    return StageErrors(np.array(error), np.array(sd), 1 - len(error) / seen)
+    return StageErrors(np.array(error), np.array(sd), 1 - len(error) / seen, np.full(len(error), np.nan))
 
 
 def plain_orders(field: int, degree: int) -> Orders:

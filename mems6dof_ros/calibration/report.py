@@ -16,6 +16,8 @@ from mems6dof_ros.calibration.calibrate import CalibrationResult
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.model_fit import GROUPS
 from mems6dof_ros.calibration.optical_model import FEATURES
+from mems6dof_ros.calibration.psf_fit import WAVEFRONT
+from mems6dof_ros.calibration.psf_pupil import PUPIL_TERMS
 from mems6dof_ros.calibration.rho_amp import inverse_curves, rho_amp_of_scan
 
 #: The paper's axial range, +/- m.
@@ -42,6 +44,8 @@ def write_report(result: CalibrationResult, path: str | Path) -> None:
         ("Scatter of the beads about the model, held out", scatter(result)),
         ("Cross-validation over whole beads", cross_validation(result)),
         ("Focus surface and the beads' own heights", focus_surface(result)),
+        ("The beads' pupils and the smooth field through them (method psf)", pupils(result)),
+        ("Illumination: the beads' light in focus", illumination(result)),
         ("Beads used and rejected", bead_map(result)),
     ]
     environment = Environment(loader=PackageLoader("mems6dof_ros.calibration", "."), autoescape=True)
@@ -206,6 +210,55 @@ def focus_surface(result: CalibrationResult) -> Picture:
     right.set(title="own heights of the beads", xlabel="X / µm", ylabel="Y / µm", aspect="equal")
     right.invert_yaxis()
     picture.colorbar(dots, ax=right, label="nm")
+    return picture
+
+
+def pupils(result: CalibrationResult) -> Picture | None:
+    """Wavefront coefficients of every bead with the mean of the model; two of them over the field."""
+    model = result.calibration.psf
+    if model is None:
+        return None
+    nm = model.imaging.wavelength * 1e9
+    found = np.array([pupil.parameters[WAVEFRONT] for pupil in result.pupils]) * nm
+    x, y = (np.array([getattr(curve, axis) for curve in result.curves]) for axis in "xy")
+    smooth = model.at(x, y)[0] * nm
+    picture = Picture(figsize=(11, 3.6), layout="constrained")
+    left, middle, right = picture.subplots(1, 3)
+    terms = np.arange(len(PUPIL_TERMS))
+    left.plot(terms, found.T, ".", color="0.6", ms=3)
+    left.errorbar(
+        terms,
+        smooth.mean(axis=0),
+        np.sqrt(np.diag(model.scatter)[:-1]) * nm,
+        fmt="C3_",
+        label="mean, scatter",
+    )
+    left.set(title="wavefront, all beads", xlabel="Zernike term (OSA/ANSI)", ylabel="nm rms", xticks=terms)
+    left.set_xticklabels([str(term) for term in PUPIL_TERMS])
+    left.legend(fontsize=7)
+    for axis, index in ((middle, 0), (right, 1)):
+        dots = axis.scatter(x * 1e6, y * 1e6, c=found[:, index], cmap="coolwarm", s=25)
+        axis.set(title=f"astigmatism, {(45, 0)[index]} degrees", xlabel="X / µm", ylabel="Y / µm")
+        axis.set_aspect("equal")
+        axis.invert_yaxis()
+        picture.colorbar(dots, ax=axis, label="nm rms")
+    return picture
+
+
+def illumination(result: CalibrationResult) -> Picture | None:
+    """Light of every bead against its distance from the axis, with the map."""
+    light = result.calibration.model.illumination
+    if light is None or len(result.beads) < 2:
+        return None
+    x, y = (np.array([getattr(curve, axis) for curve in result.curves]) for axis in "xy")
+    flux = np.array([bead.flux for bead in result.beads])
+    picture = Picture(figsize=(6.5, 3.4), layout="constrained")
+    axis = picture.subplots()
+    radius = np.hypot(x, y) * 1e6
+    axis.plot(radius, flux / np.median(flux), "o", color="0.6", ms=4, label="beads")
+    axis.plot(radius, np.exp(light(x, y)), "C3.", label="map, 1 on the axis")
+    axis.set(xlabel="distance from the axis / µm", ylabel="relative light", ylim=(0, None))
+    axis.legend()
     return picture
 
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mems6dof_ros.calibration.calibrate import CalibrationResult, calibrate
+from mems6dof_ros.calibration.calibrate import CalibrationResult, CalibrationSettings, calibrate
 from mems6dof_ros.calibration.file import Calibration
 from mems6dof_ros.calibration.focus_stack import FocusStack, measure_stack
 from mems6dof_ros.calibration.validation import Particles
@@ -19,7 +19,10 @@ from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
 
 WINDOW_PX = 41
-FIELD = SimulationSettings(width_px=640, height_px=640, clumps=0, optics="paper")
+FIELD = SimulationSettings(width_px=512, height_px=512, clumps=0, optics="paper")
+IMAGING = CalibrationSettings(
+    numerical_aperture=FIELD.numerical_aperture, wavelength=FIELD.wavelength, bead_diameter=FIELD.diameter
+)
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,9 @@ class Held:
 
 
 def make_stack(optics_seed: int, electrons: float, **options: float) -> FocusStack:
-    """A stack of about 45 beads through the optics number ``optics_seed``."""
+    """A stack of about 30 beads through the optics number ``optics_seed``."""
     settings = replace(FIELD, optics_seed=optics_seed, electrons=electrons, seed=optics_seed)
-    frames = focus_stack(settings, -5.6e-6, 5.6e-6, 0.2e-6, beads=70, seed=10 + optics_seed, **options)
+    frames = focus_stack(settings, -5.6e-6, 5.6e-6, 0.28e-6, beads=56, seed=10 + optics_seed, **options)
     return measure_stack(frames, camera_noise(settings), DEFAULT_WEIGHTING, WINDOW_PX, "simulated")
 
 
@@ -82,8 +85,8 @@ def stack() -> FocusStack:
 
 @pytest.fixture(scope="session")
 def calibrated(stack: FocusStack) -> CalibrationResult:
-    """The paper's optics number 3, calibrated at 1e5 electrons."""
-    return calibrate([stack])
+    """The paper's optics number 3, calibrated at 1e5 electrons for all methods."""
+    return calibrate([stack], IMAGING)
 
 
 @pytest.fixture(scope="session")

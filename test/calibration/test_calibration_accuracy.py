@@ -16,7 +16,10 @@ def rms(values):
 
 @pytest.mark.parametrize(
     ("electrons", "limits"),
-    [(3e4, {"rho_amp": 80e-9, "joint": 45e-9}), (1e5, {"rho_amp": 70e-9, "joint": 32e-9})],
+    [
+        (3e4, {"rho_amp": 80e-9, "joint": 45e-9, "psf": 40e-9}),
+        (1e5, {"rho_amp": 70e-9, "joint": 32e-9, "psf": 25e-9}),
+    ],
 )
 def test_z_of_other_beads(calibrated, particles, held, electrons, limits):
     measured = particles(3, electrons, 1.5e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,34 @@ def test_round_trip_locates_identically(calibrated, path):
         np.testing.assert_array_equal(before.position, after.position)
         np.testing.assert_array_equal(before.covariance, after.covariance)
         np.testing.assert_array_equal(before.flags, after.flags)
+
+
+def test_round_trip_of_the_point_spread_function(calibrated, path, particles):
+    frame = particles(3, 1e5, 1.5e-6)[2]
+    before = calibrated.calibration.with_method("psf").locate(frame.fits, frame.image)
+    after = load_calibration(path, "psf").locate(frame.fits, frame.image)
+    np.testing.assert_array_equal(before.position, after.position)
+    np.testing.assert_array_equal(before.covariance, after.covariance)
+
+
+def test_psf_wants_what_it_reads(calibrated):
+    fits = calibrated.beads[0].fits
+    with pytest.raises(InputError, match="image"):
+        calibrated.calibration.with_method("psf").locate(fits)
+    with pytest.raises(InputError, match="does not contain"):
+        replace(calibrated.calibration, psf=None).with_method("psf")
+
+
+def test_file_without_newer_sections_keeps_its_name_and_loads(calibrated, tmp_path):
+    """As written before the point-spread function and the illumination were measured."""
+    model = replace(calibrated.calibration.model, illumination=None)
+    old = replace(calibrated.calibration, psf=None, model=model)
+    save_calibration(old, tmp_path / "old.yaml")
+    assert "psf" not in (tmp_path / "old.yaml").read_text().split("provenance:")[0]
+    loaded = load_calibration(tmp_path / "old.yaml")
+    assert loaded.psf is None
+    assert loaded.model.illumination is None
+    assert loaded.calibration_id == old.calibration_id
 
 
 def test_nothing_unfinished_stays(path):

@@ -11,7 +11,13 @@ import pytest
 
 from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
 from mems6dof_ros.calibration.focus_stack import measure_stack
-from mems6dof_ros.calibration.real_stacks import astigmatic_stack, one_bead_left_out, plain_orders
+from mems6dof_ros.calibration.real_stacks import (
+    ASTIGMATIC,
+    astigmatic_frames,
+    astigmatic_stack,
+    one_bead_left_out,
+    plain_orders,
+)
 from mems6dof_ros.calibration.report import write_report
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
@@ -137,12 +143,14 @@ def real_data() -> Path:
 
 @pytest.mark.skipif(not real_data().is_dir(), reason="no real micrographs")
 def test_real_astigmatic_stack():
-    """Wanted: 30 nm rms, 18 nm median; measured 43 and 27 where not flagged (docs/calibration.md)."""
-    stack = astigmatic_stack(real_data())
+    """Within 300 nm of focus, two beads left out: wanted are 30 nm rms and 18 nm median, against the stage as
+    the other beads see it (docs/calibration.md); `mems6dof validate calibration` leaves out all."""
+    planes = astigmatic_frames(real_data())
+    stack = astigmatic_stack(planes)
     assert len(stack.beads) >= 10
-    found = one_bead_left_out(stack, 500e-9, plain_orders(0, 6), "joint")
-    print(f"real, one bead left out: {found.rms * 1e9:.0f} nm rms, {found.median * 1e9:.0f} nm median")
-    assert found.flagged < 0.35
-    assert found.rms < 55e-9
-    assert found.median < 35e-9
-    assert 0.75 < found.claimed_over_actual < 1.3
+    settings = replace(ASTIGMATIC, orders=plain_orders(0, 6))
+    found = one_bead_left_out(stack, planes, 300e-9, settings, ("psf",), beads=(0, 5))["psf"]
+    print(f"real, one bead left out: {found.apart.rms * 1e9:.0f} nm rms, {found.rms * 1e9:.0f} of the stage")
+    assert found.flagged < 0.2
+    assert found.apart.rms < 30e-9
+    assert found.apart.median < 18e-9

@@ -114,7 +114,7 @@ class InstrumentNode(ManagedNode):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **options: Any
     ) -> Any:
-        """As rclpy's, but a message that ``callback`` raises InputError for, or cannot decode, is refused."""
+        """As rclpy's, but a message that ``callback`` raises InputError for is refused and counted."""
 
         @functools.wraps(callback)
         def take(*arguments: Any) -> None:
@@ -122,10 +122,6 @@ class InstrumentNode(ManagedNode):
                 callback(*arguments)
             except InputError as error:
                 self.health.refused(f"{topic}: {error}")
-            except RuntimeError as error:
-                if "failed to deserialize" not in str(error):
-                    raise
-                self.health.refused(f"{topic}: {len(arguments[0])} bytes that are no {msg_type.__name__}")
 
         return super().create_subscription(msg_type, topic, take, qos_profile, **options)
 

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.parameter import parameter_value_to_python
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -183,7 +182,7 @@ class MonitorNode(InstrumentNode):
 
     def _on_pose(self, data: bytes) -> None:
         self._counts[topics.POSE_6DOF] += 1
-        if pose := self._add_pose(deserialize_message(data, Pose6DOF)):
+        if pose := self._add_pose(transport.deserialize(data, Pose6DOF)):
             self._newest, self._newest_at = pose, time.monotonic()
 
     def _add_pose(self, message: Pose6DOF) -> CyclePose | None:
@@ -209,7 +208,7 @@ class MonitorNode(InstrumentNode):
 
     def _follow_body(self, body: str) -> None:
         def on_pose(data: bytes) -> None:
-            message = deserialize_message(data, Pose6DOF)
+            message = transport.deserialize(data, Pose6DOF)
             if message.body == body:
                 self._add_pose(message)
             else:  # not a body of ours, but another instrument in a namespace below
@@ -223,20 +222,20 @@ class MonitorNode(InstrumentNode):
         self._found[transport.stamp_of(data)] = data  # only the few that are drawn are ever decoded
 
     def _on_frame_info(self, data: bytes) -> None:
-        message = deserialize_message(data, FrameInfo)
+        message = transport.deserialize(data, FrameInfo)
         self._counts[topics.FRAME_INFO] += 1
         self._heard_at = time.monotonic()
         self._frames_dropped += message.frames_dropped
         self._infos[messages.nanoseconds(message.header.stamp)] = message
 
     def _on_truth(self, data: bytes) -> None:
-        message = deserialize_message(data, GroundTruth)
+        message = transport.deserialize(data, GroundTruth)
         self._truths[messages.nanoseconds(message.header.stamp), message.body] = messages.to_ground_truth(
             message
         )
 
     def _on_controller(self, data: bytes) -> None:
-        message = deserialize_message(data, ControllerState)
+        message = transport.deserialize(data, ControllerState)
         self._tell_controller(
             state=_STATES.get(message.state, "unknown"),
             reason=message.reason,
@@ -251,7 +250,7 @@ class MonitorNode(InstrumentNode):
         self._feed.set_instrument({"controller": self._controller})
 
     def _on_diagnostics(self, data: bytes) -> None:
-        for status in deserialize_message(data, DiagnosticArray).status:
+        for status in transport.deserialize(data, DiagnosticArray).status:
             self._diagnostics[status.name] = {
                 "name": status.name,
                 "level": int.from_bytes(status.level, "little"),
@@ -326,7 +325,10 @@ class MonitorNode(InstrumentNode):
                 if data or not self._feed.watchers:
                     last_image_at = now
                 if self._feed.watchers and (data or now - last_image_at > _NO_IMAGES):
-                    self._paint_one(data)
+                    try:
+                        self._paint_one(data)
+                    except InputError as error:
+                        self._feed.tell("warning", str(error))
         except Exception as error:  # handed to the main thread, which ends the node
             self.failure = error
 
@@ -341,17 +343,13 @@ class MonitorNode(InstrumentNode):
         while time.monotonic() < deadline and not (stamp in self._found and stamp in self._poses):
             time.sleep(0.02)
         info, found = self._infos.get(stamp), self._found.get(stamp)
-        try:
-            picture = make_picture(
-                messages.to_frame(deserialize_message(data, Image), info) if data else None,
-                messages.to_localizations(deserialize_message(found, Localizations)) if found else None,
-                self._poses.get(stamp, []),
-                self._feed.bodies,
-            )
-        except InputError as error:
-            self._feed.tell("warning", str(error))
-        else:
-            self._feed.add_picture(picture)
+        picture = make_picture(
+            messages.to_frame(transport.deserialize(data, Image), info) if data else None,
+            messages.to_localizations(transport.deserialize(found, Localizations)) if found else None,
+            self._poses.get(stamp, []),
+            self._feed.bodies,
+        )
+        self._feed.add_picture(picture)
 
     # What the page asks for ---------------------------------------------------------------------
 

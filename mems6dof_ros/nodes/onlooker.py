@@ -67,9 +67,9 @@ class PolledSubscriptions:
     ) -> Callable[[], None]:
         """Call ``act`` with every message of ``topic``, until what is returned is called."""
         subscription = self._node.create_subscription(
-            kind, topic, lambda _: None, quality, callback_group=self._group, raw=True
+            kind, topic, act, quality, callback_group=self._group, raw=True
         )
-        taken = (subscription, act)
+        taken = (subscription, subscription.callback)  # refuses what act refuses
         self._taken.append(taken)
 
         def end() -> None:

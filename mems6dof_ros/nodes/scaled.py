@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from mems6dof_ros.nodes import transport
@@ -39,9 +38,9 @@ class ScaledCopies:
 
     def _publish(self) -> None:
         if data := self._newest.pop(topics.POSE, None):
-            self._poses.publish(enlarged_pose(deserialize_message(data, PoseStamped), self._scale))
+            self._poses.publish(enlarged_pose(transport.deserialize(data, PoseStamped), self._scale))
         if data := self._newest.pop(_LOCALIZED, None):
-            self._points.publish(enlarged_points(deserialize_message(data, PointCloud2), self._scale))
+            self._points.publish(enlarged_points(transport.deserialize(data, PointCloud2), self._scale))
 
 
 def enlarged_pose(pose: PoseStamped, scale: float) -> PoseStamped:

@@ -12,8 +12,10 @@ import os
 import shutil
 import struct
 from pathlib import Path
+from typing import Any
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import shared_memory
@@ -89,6 +91,14 @@ def stamp_of(data: bytes) -> int:
         raise InputError("serialized message", f"{len(data)} bytes", "a header")
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def deserialize(data: bytes, kind: type) -> Any:
+    """The message of ``kind`` that ``data`` is; InputError where it is none."""
+    try:
+        return deserialize_message(data, kind)
+    except RuntimeError as error:
+        raise InputError(kind.__name__, f"{len(data)} bytes that are none", "a serialized message") from error
 
 
 def keep_large_buffers() -> None:

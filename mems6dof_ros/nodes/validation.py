@@ -17,6 +17,7 @@ from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.cli.demo import BODY, REQUIREMENTS, measure, prepare
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.localization.validation import matched_fits
+from mems6dof_ros.nodes.bodies_validation import bodies_figures
 from mems6dof_ros.nodes.system import chain, replayed, run_system
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.simulation.settings import SimulationSettings
@@ -38,6 +39,7 @@ def figures(settings: SimulationSettings, cycles: int, out: Path) -> list[Figure
         *_poses(recording, cycles),
         *_record(bag, recording),
         *_replay(bag, calibration, out),
+        *bodies_figures(settings, calibration, out),
         *matched_fits(10_000, 1),
     ]
 

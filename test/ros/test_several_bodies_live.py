@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from peers import PATIENCE
+from peers import PATIENCE, NodeProcess, Peer
+from std_srvs.srv import Trigger
 
+from mems6dof_msgs.msg import Localizations as LocalizationsMessage
+from mems6dof_msgs.msg import Pose6DOF
 from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.analysis.truth import compare
+from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.nodes.system import chain, run_system, simulated
 from mems6dof_ros.pose.bodies import relative_pose
 from mems6dof_ros.pose.bodies_file import load_bodies
+from mems6dof_ros.pose.field import FieldError
+from mems6dof_ros.pose.settings import PoseSettings
+from mems6dof_ros.pose.synthetic import Scene, SyntheticGear
+from mems6dof_ros.recording import messages
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.recording.poses import pose_topics
 
@@ -70,7 +80,41 @@ def test_two_bodies(tmp_path: Path, calibration: str, arrangement: str) -> None:
         for pose in again.update(found):
             live = next(p for p in recording.poses[pose.body] if p.stamp_ns == stamp)
             np.testing.assert_allclose(live.displacement, pose.displacement, rtol=0, atol=1e-12)
-    for body, poses in recording.poses.items():
+    for poses in recording.poses.values():
         truths = [truth for truth in recording.truth_of(poses) if truth is not None]
-        print(body, compare(poses, truths).nees_per_dof, compare(poses, truths).rms)
         assert 0.4 < compare(poses, truths).nees_per_dof < 2
+
+
+def test_a_field_correction_is_saved_for_the_next_session(
+    tmp_path: Path, calibration: str, peer: Peer, start: Callable[..., NodeProcess]
+) -> None:
+    """What the node has learnt becomes a calibration; localizations by another one are refused."""
+    corrected = tmp_path / "corrected.yaml"
+    parameters = {"calibration": calibration, "field_correction": corrected}
+    arguments = [part for item in parameters.items() for part in ("-p", "{}:={}".format(*item))]
+    node = start("pose_estimator", *arguments)
+    publisher = peer.publisher(LocalizationsMessage, "localizations")
+    peer.listen(Pose6DOF, "pose_6dof")
+    answer = peer.call(Trigger, "pose_estimator/save_field_correction")
+    assert (answer.success, "no cycle yet" in answer.message) == (False, True)
+
+    optics = load_calibration(calibration)
+    gear = SyntheticGear(Scene(field=(65e-6, 65e-6), radius=30e-6, particles=40, field_error_xy=3e-9), 1)
+    for count in range(1, 25):
+        found = replace(gear.observe()[0], calibration_id=optics.calibration_id)
+        publisher.publish(messages.to_rclpy(messages.localizations(found)))
+        peer.wait(lambda count=count: len(peer.received["pose_6dof"]) == count)
+        gear.advance()
+    answer = peer.call(Trigger, "pose_estimator/save_field_correction")
+    assert answer.success, answer.message
+    written = load_calibration(corrected)
+    assert written.calibration_id in answer.message
+    learnt = written.correction.provenance["recordings"][0]
+    assert (learnt["recording"], learnt["cycles"]) == ("live, /pose_estimator", 24)
+    assert np.trace(written.correction.covariance) < 0.9 * np.trace(
+        FieldError.assumed(PoseSettings(), np.array([32.5e-6, 32.5e-6])).prior
+    )
+
+    other = replace(gear.observe()[0], calibration_id="another")
+    publisher.publish(messages.to_rclpy(messages.localizations(other)))
+    node.wait_for_line("by calibration another")

@@ -71,7 +71,7 @@ def die(work: Path, seed: int, kills: int, size: int, rate: float) -> Iterator[D
         for _ in range(kills):
             shutil.rmtree(bag, ignore_errors=True)
             with witnessed_recorder(namespace, bag, noted, split_duration=0.7) as (process, journal):
-                until(lambda: len(journal.written[0]), "message recorded")
+                until(lambda: len(journal.written[0]), "message recorded", process)
                 time.sleep(rng.uniform(0.05, 1.5))
                 killed = kill(process)
             yield _examine(bag, journal, killed)

@@ -53,15 +53,17 @@ def _module(
     finally:
         process.terminate()
         _, said = process.communicate(timeout=60)
-    if process.returncode > 0:
-        raise Mems6dofError(f"{what} ended with {process.returncode}: {said.strip()[-300:]}")
+        if process.returncode > 0:
+            raise Mems6dofError(f"{what} ended with {process.returncode}: {said.strip()[-300:]}")
 
 
-def until(condition: Callable[[], Any], what: str, timeout: float = 60.0) -> None:
-    """Poll; Mems6dofError after ``timeout`` s."""
+def until(
+    condition: Callable[[], Any], what: str, process: subprocess.Popen[str], timeout: float = 60.0
+) -> None:
+    """Poll; Mems6dofError after ``timeout`` s, or when ``process`` has ended."""
     deadline = time.monotonic() + timeout
     while not condition():
-        if time.monotonic() > deadline:
+        if time.monotonic() > deadline or process.poll() is not None:
             raise Mems6dofError(f"no {what} within {timeout:g} s")
         time.sleep(0.01)
 

@@ -22,7 +22,7 @@ from mems6dof_ros.calibration.moments import Moments
 from mems6dof_ros.calibration.psf_likelihood import MARGIN, maximise
 from mems6dof_ros.calibration.psf_model import MARGIN_PX, PsfModel
 from mems6dof_ros.calibration.psf_pupil import PUPIL_TERMS, PupilImages
-from mems6dof_ros.calibration.zernike import zernike, zernike_count
+from mems6dof_ros.calibration.zernike import zernike, zernike_count, zernike_order
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.kernels import pixels
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
@@ -35,7 +35,7 @@ MOST_MODES, LEAST_MODE = 4, 0.1
 _SECOND = 60.0
 #: Residual light relative to the calibration beads' that makes a fit poor, and where it does not matter yet.
 _POOR, _LEAST_POOR = 4.0, 0.03
-_FIELD_ORDER, _FIELD_GRID, _DEGREE = 5, 7, 26
+_MOST_ORDER, _DEGREE = 5, 26
 _BACKGROUND = 10.0  # electrons per pixel, for weights only
 _SAMPLE = 800
 
@@ -171,8 +171,10 @@ def compress(
     side = window_px + MARGIN_PX
     pupil = PupilImages(model.imaging, side + -side % 4)
     scale = float(np.exp(model.ln_diameter))
-    constant = model.wavefront.shape[1] == 1 and model.slope.shape[1] == 1
-    grid = 1 if constant else _FIELD_GRID
+    # Images are not linear in the wavefront: they vary over the field with higher orders than it does.
+    order = zernike_order(model.wavefront.shape[1])
+    order = min(order + 2, _MOST_ORDER) if order > 0 else 0
+    grid = order + 2 if order > 0 else 1
     # Chebyshev nodes over the field as over defocus: what is fitted there is as good at the edges.
     nodes = -np.cos(np.pi * (np.arange(grid) + 0.5) / grid)
     x, y = (
@@ -207,7 +209,6 @@ def compress(
     amplitudes = (flat * weight) @ kept
     images = (kept.T / weight).reshape(-1, size, size)
     amplitudes = amplitudes.reshape(1 + len(modes), len(x), len(u), -1)
-    order = 0 if constant else _FIELD_ORDER
     over_field = np.linalg.pinv(zernike(order, x / model.radius, y / model.radius))
     over_defocus = np.linalg.pinv(chebyshev.chebvander(heights, _DEGREE))
     coefficients = np.einsum("jf,du,mfuk->mkjd", over_field, over_defocus, amplitudes, optimize=True)

@@ -19,7 +19,7 @@ from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
 
 #: Cycles of a revolution; the drive makes no error, so that the frames can be repeated without a jump.
-CYCLES = 20
+CYCLES = 40
 #: On the gear, of which about 100 lie in the field.
 PARTICLES = 130
 

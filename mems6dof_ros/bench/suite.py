@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 from mems6dof_ros.bench.material import Material
 from mems6dof_ros.bench.table import Row
@@ -28,14 +32,26 @@ ROWS = {
 
 def measure(
     names: Sequence[str], material: Material, progress: Callable[[str], None] = lambda name: None
-) -> list[Row]:
-    """Rows ``names`` (empty: all). Raises InputError for a name that does not exist."""
+) -> Iterator[Row]:
+    """Rows ``names`` (empty: all), each when it is measured; what fails becomes a row that says why.
+
+    Raises InputError for a name that does not exist.
+    """
     for name in names:
         if name not in ROWS:
             raise InputError("rows", f"'{name}'", f"of {', '.join(ROWS)}")
-    rows = []
-    for name in [row for row in ROWS if row in names or not names]:
+    return _rows([row for row in ROWS if row in names or not names], material, progress)
+
+
+def _rows(names: Sequence[str], material: Material, progress: Callable[[str], None]) -> Iterator[Row]:
+    for name in names:
         progress(name)
         module, function = ROWS[name].split(":")
-        rows += getattr(importlib.import_module(f"mems6dof_ros.bench.{module}"), function)(material)
-    return rows
+        begin, load = time.monotonic(), os.getloadavg()[0]
+        try:
+            rows = getattr(importlib.import_module(f"mems6dof_ros.bench.{module}"), function)(material)
+        except Exception as error:  # the other rows are worth having; the trace tells where
+            traceback.print_exc()
+            rows = [Row(name, 0.0, "rows", figure=0.0, least=1.0, note=f"not measured: {error!r}")]
+        last = {**rows[-1].details, "s for these rows": time.monotonic() - begin, "load before": load}
+        yield from (*rows[:-1], replace(rows[-1], details=last))

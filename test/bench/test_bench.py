@@ -103,3 +103,17 @@ def test_the_table_is_aligned() -> None:
     rows = [Row("a", 1.0, "s"), Row("a longer name", 2.0, "ms", "peer", 3.0, 1.5, 1.0, note="why")]
     out = table.lines(rows)
     assert out[0].index("against") == out[2].index("peer")
+
+
+def test_a_row_that_fails_says_so_and_leaves_the_others(
+    material: Material, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(material: Material) -> list[Row]:
+        raise RuntimeError("no such node")
+
+    monkeypatch.setattr(chain, "in_memory", broken)
+    monkeypatch.setattr(kernels, "_optional", lambda name: None)
+    rows = list(suite.measure(["memory", "detection"], material))
+    assert [row.passed for row in rows] == [None, False]
+    assert "no such node" in rows[1].note
+    assert rows[0].details["load before"] >= 0

@@ -94,10 +94,15 @@ class Bystander:
                 self.reports[name] += 1
 
     def listen(
-        self, kind: type, topic: str, act: Callable[[Any], None], quality: QoSProfile = transport.MESSAGES
+        self,
+        kind: type,
+        topic: str,
+        act: Callable[[Any], None],
+        quality: QoSProfile = transport.MESSAGES,
+        raw: bool = False,
     ) -> None:
-        """Call ``act`` with each message."""
-        self.node.create_subscription(kind, topic, act, quality)
+        """Call ``act`` with each message, ``raw``: serialized."""
+        self.node.create_subscription(kind, topic, act, quality, raw=raw)
 
     def call(self, kind: type, service: str) -> None:
         """Call a service and wait for its answer."""

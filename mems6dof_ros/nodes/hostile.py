@@ -59,16 +59,17 @@ def figures(work: Path, seed: int, tell: Callable[[str], None]) -> Iterator[Figu
     settings = SimulationSettings(**SMALL, seed=seed, optics_seed=seed)  # type: ignore[arg-type]
     tell("calibrate simulated optics")
     calibration = work / "optics.yaml"
-    calibrate_small(settings, calibration)
+    calibrate_quickly(settings, calibration)
     tell("broken images and localizations among good ones")
     yield from broken_frames(settings, calibration, 48, work)
     tell("nonsense on every topic")
     yield from fuzzed_topics(settings, calibration, 30, seed, work)
 
 
-def calibrate_small(settings: SimulationSettings, path: Path) -> None:
-    """A calibration of the optics of ``settings``, from few beads: there is room for no more."""
-    frames = focus_stack(settings, -3e-6, 3e-6, 0.25e-6, beads=30, seed=3)
+def calibrate_quickly(settings: SimulationSettings, path: Path) -> None:
+    """A calibration of the optics of ``settings``, from as many beads as there is room for, but 200."""
+    beads = min(200, 30 * settings.width_px**2 // 512**2)
+    frames = focus_stack(settings, -3e-6, 3e-6, 0.25e-6, beads=beads, seed=3)
     stack = measure_stack(frames, camera_noise(settings), DEFAULT_WEIGHTING, DEFAULT_WINDOW_PX)
     save_calibration(calibrate([stack]).calibration, path)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from mems6dof_ros.pose.cycle_pose import PaperAngles
@@ -41,12 +42,13 @@ def from_swing_twist(tilt_x: float, tilt_y: float, psi: float) -> Array:
     return exp_so3(np.array([tilt_x, tilt_y, 0.0])) @ rotation_z(psi)
 
 
+@njit(cache=True, nogil=True)
 def swing_twist_jacobian(tilt_x: float, tilt_y: float) -> Array:
     """d(tilt_x, tilt_y, psi) / d(w), (3, 3), for a rotation disturbed as ``R -> Exp(w) R``."""
     tilt = np.array([tilt_x, tilt_y, 0.0])
     columns = left_jacobian(tilt)
     columns[:, 2] = exp_so3(tilt)[:, 2]  # the twist turns about the body's axis
-    return np.asarray(np.linalg.inv(columns), float)
+    return np.linalg.inv(columns).astype(np.float64)
 
 
 def unwrap_near(angle: float, near: float) -> float:

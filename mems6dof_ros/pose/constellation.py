@@ -38,6 +38,8 @@ NOISE_MEMORY = 400.0
 OVERLAP_FACTOR = 9.0
 #: Outliers in a row that prove a particle is not where the map has it.
 OUTLIERS_IN_A_ROW = 4
+#: Keeps numbers sound where particles hardly fix a pose; relative to what fixes it.
+LEAST_PIVOT = 1e-12
 #: Poses of a revolution over which the constant effect of the field error is taken.
 AROUND = 16
 #: Largest interval between two refinements, cycles.
@@ -273,7 +275,7 @@ class Constellation:
         if self._eliminated:
             taken = np.concatenate(self._eliminated)
             # In place: the lower triangle in rows is the upper one in columns.
-            dsyrk(-1.0, taken.T, beta=1.0, c=self._information.T, overwrite_c=1)
+            self._information = dsyrk(-1.0, taken.T, beta=1.0, c=self._information.T, overwrite_c=1).T
             self._eliminated.clear()
 
     def _forget_retired(self) -> None:
@@ -394,7 +396,7 @@ def _accumulate(information, vector, rows, rotation, offset, weight, moved, mode
 
     With W the weights, F the modes and J = [1, -hat(R p)], all turned into the body frame, that is the sum of
     [F R]^T W [F R] less its projection on the pose, E^T (J^T W J)^-1 E with E = J^T W [F R]. The projection
-    is returned as L^-1 E (6, size), where L L^T = J^T W J: its square is still to be taken off.
+    is returned as L^-1 E (6, size), L L^T = J^T W J: its square is still to be taken off.
     """
     n, k = len(rows), modes.shape[2]
     evidence = np.zeros((6, len(vector)))
@@ -441,7 +443,16 @@ def _accumulate(information, vector, rows, rotation, offset, weight, moved, mode
         for m in range(k):
             vector[m] += wf[3 * i, m] * r[0] + wf[3 * i + 1, m] * r[1] + wf[3 * i + 2, m] * r[2]
     information[:k, :k] += np.dot(modes.reshape(3 * n, k).T, wf)
-    # L^-1 E and L^-1 pull by forward substitution.
+    # L^-1 E and L^-1 pull by forward substitution, in units in which J^T W J has a diagonal of ones; what the
+    # particles hardly fix must not make it fail.
+    scale = 1 / np.sqrt(np.diag(normal))
+    for c in range(6):
+        for b in range(c + 1):
+            normal[c, b] *= scale[c] * scale[b]
+        normal[c, c] += LEAST_PIVOT
+        pull[c] *= scale[c]
+        for m in range(len(vector)):
+            evidence[c, m] *= scale[c]
     lower = np.linalg.cholesky(normal)
     for c in range(6):
         for b in range(c):

@@ -226,11 +226,12 @@ class PoseEstimator:
         ids = constellation.ids[rows]
         modes = constellation.modes.evaluate(seen.position)
         factor = constellation.noise_factor(rows) * (self._noise[0] / self._noise[1])
+        noise = scaled(seen.covariance, factor)
         response, spread = constellation.field_response(rows, start, modes)
         solution = solve_pose(
             start, constellation.position[rows], constellation.covariance[rows],
-            seen.position - modes @ constellation.field_mean, scaled(seen.covariance, factor), seen.has_z,
-            response, spread, s.gate_xy, s.gate_z,
+            seen.position - modes @ constellation.field_mean, noise, seen.has_z, response, spread,
+            s.gate_xy, s.gate_z,
         )  # fmt: skip
         used, used_z = int((solution.use > UNUSED).sum()), int((solution.use == FULL).sum())
         if not solution.ok or used < s.min_particles:
@@ -259,7 +260,7 @@ class PoseEstimator:
             self._lesson = partial(self._follow, view, constellation, state.pose, match, in_solution)
         else:
             self._lesson = partial(
-                self._learn, view, constellation, state, solution, match, part, modes, inside, factor
+                self._learn, view, constellation, state, solution, match, part, noise, modes, inside
             )
         if last is None:
             # The first pose in an adopted constellation is the reference; its frame is at the centre.
@@ -401,11 +402,12 @@ class PoseEstimator:
 
     def _learn(
         self, view: Usable, constellation: Constellation, state: State, solution: Solution, match: Indices,
-        part: Indices, modes: Array, inside: Mask, factor: Array,
+        part: Indices, noise: Array, modes: Array, inside: Mask,
     ) -> None:  # fmt: skip
-        """Refine the map and its membership by one cycle; ``part``: localizations in the solution."""
+        """Refine the map and its membership by one cycle; ``part`` (n,): localizations in the solution, with
+        ``noise`` (n, 3, 3)."""
         rows, good = match[part], solution.use > UNUSED
-        weight = weights(scaled(view.covariance[part[good]], factor[good]), solution.use[good] == FULL)
+        weight = weights(noise[good], solution.use[good] == FULL)
         offset = view.position[part[good]] - state.pose.apply(constellation.linearisation(rows[good]))
         constellation.observe(rows[good], state.pose, offset, weight, modes[good])
         seen = match[match >= 0]

@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -43,9 +44,10 @@ class RigidPose(NamedTuple):
 IDENTITY = RigidPose(np.eye(3), np.zeros(3))
 
 
+@njit(cache=True, nogil=True)
 def hat(v: Array) -> Array:
     """Cross-product matrix (3, 3) of ``v`` (3,): ``hat(v) @ u = v x u``."""
-    x, y, z = v
+    x, y, z = v[0], v[1], v[2]
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
@@ -55,6 +57,7 @@ def rotation_z(angle: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+@njit(cache=True, nogil=True)
 def exp_so3(w: Array) -> Array:
     """Rotation matrix (3, 3) of the rotation vector ``w`` (3,) rad (Rodrigues)."""
     angle = math.sqrt(float(w @ w))
@@ -87,6 +90,7 @@ def log_so3(rotation: Array) -> Array:
     return axis * (angle if vee @ axis >= 0 else -angle)
 
 
+@njit(cache=True, nogil=True)
 def left_jacobian(w: Array) -> Array:
     """J (3, 3) of ``Exp(w + d) = Exp(J d) Exp(w)`` to first order (Sola et al. 2018, eq. 145)."""
     angle = math.sqrt(float(w @ w))

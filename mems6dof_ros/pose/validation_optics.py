@@ -41,12 +41,13 @@ def optical_chain(
     seed: int,
     cycles: int,
     electrons: float = 6e4,
+    method: str = "psf",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> OpticalRun:
-    """Calibrate simulated optics from focus stacks, render ``cycles`` of the turning gear, localize them,
-    estimate: minutes."""
+    """Calibrate simulated optics from focus stacks, render ``cycles`` of the turning gear, localize them by
+    ``method`` (see calibration), estimate: minutes."""
     settings = SimulationSettings.from_dict({"seed": seed, "optics_seed": seed, "electrons": electrons})
-    calibration = calibrate_simulated(settings).calibration
+    calibration = calibrate_simulated(settings, psf=method == "psf").calibration.with_method(method)
     localizer, estimator = Localizer(camera_noise(settings), calibration), PoseEstimator()
     experiment = Experiment(settings)
     poses, truths, bounds = [], [], []

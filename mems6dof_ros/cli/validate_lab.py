@@ -17,6 +17,7 @@ from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
 PARTS = {
     "messages": "mems6dof_ros.nodes.hostile",
     "outages": "mems6dof_ros.nodes.outages",
+    "network": "mems6dof_ros.nodes.networks",
     "bags": "mems6dof_ros.recording.validation.bags",
     "crash": "mems6dof_ros.recording.validation.crash",
     "disk": "mems6dof_ros.recording.validation.disk",

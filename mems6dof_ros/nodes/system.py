@@ -469,18 +469,20 @@ def run_system(
     namespace: str = "",
     config: str = "",
     environment: Mapping[str, str] = transport.LOCALHOST_ONLY,
+    prefix: Sequence[str] = (),
     on_line: Callable[[str], None] = print,
 ) -> Iterator[RunningSystem]:
     """Start the nodes as processes, and stop them all at the end of the context, however it ends.
 
     ``config``: directory of parameter files; ``environment``: for variables that ours does not set, by
-    default discovery limited to this machine; ``on_line`` gets every line they print, with the node's name.
+    default discovery limited to this machine; ``prefix``: of the command of each, which it must become by exec;
+    ``on_line`` gets every line they print, with the node's name.
     """
     readers = []
 
     def start(node: NodeSpec) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            command(node, namespace, config),
+            [*prefix, *command(node, namespace, config)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -36,7 +36,7 @@ from mems6dof_ros.recording.metadata import (
     metadata_text,
     write_metadata,
 )
-from mems6dof_ros.recording.recover import complete_file, mcap_files
+from mems6dof_ros.recording.recover import complete_file, lacks_end, mcap_files
 
 __all__ = ["BagReader", "BagWriter", "Channel", "Qos", "Recorded"]
 
@@ -452,6 +452,7 @@ def _readable(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        found = " ".join(str(error).split()) or type(error).__name__
-        advice = "; 'mems6dof recover' completes one that was cut off" if mcap_files(path) else ""
+        found = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        cut_off = path.exists() and any(map(lacks_end, mcap_files(path)))
+        advice = "; 'mems6dof recover' completes one that was cut off" if cut_off else ""
         raise InputError(str(path), found, f"a readable bag{advice}") from error

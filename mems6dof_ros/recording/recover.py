@@ -91,13 +91,16 @@ def mcap_files(path: Path) -> list[Path]:
 
 
 def interrupted(path: Path) -> bool:
-    """Is there a bag that its writer could not complete: the last file lacks its end?"""
-    files = mcap_files(path)
-    if not files or files[-1].stat().st_size < 2 * len(MCAP0_MAGIC):
-        return bool(files)
-    with files[-1].open("rb") as stream:
-        stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
-        return stream.read() != MCAP0_MAGIC
+    """Is there a bag that its writer could not complete?"""
+    return any(not file.stat().st_size or lacks_end(file) for file in mcap_files(path))
+
+
+def lacks_end(file: Path) -> bool:
+    """Was it begun as an .mcap file, but never completed?"""
+    with file.open("rb") as stream:
+        begun = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+        stream.seek(-min(file.stat().st_size, len(MCAP0_MAGIC)), os.SEEK_END)
+        return begun and not (file.stat().st_size > 2 * len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC)
 
 
 def recover(path: Path) -> list[Recovered]:

@@ -16,7 +16,7 @@ from mems6dof_msgs.msg import Pose6DOF
 from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.errors import Mems6dofError
-from mems6dof_ros.nodes.hostile import Intruder
+from mems6dof_ros.nodes.bystander import Bystander
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
 from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
 from mems6dof_ros.recording import topics
@@ -128,7 +128,7 @@ def small_disk(path: Path, mebibytes: int = DISK) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(path)], check=True)
 
 
-class _Watch(Intruder):
+class _Watch(Bystander):
     """Who counts the poses and reads the diagnostics."""
 
     def __init__(self, namespace: str) -> None:
@@ -189,7 +189,7 @@ def _instrument(seed: int, output: Path | None, **of_recorder: Any) -> Iterator[
         calibration="",
         output=str(output or ""),
         recorded=[*DEFAULT_TOPICS, topics.IMAGE],
-        watched={topics.POSE_6DOF: "intruder"},
+        watched={topics.POSE_6DOF: "bystander"},
     )
     nodes = [_with(node, "recorder", **of_recorder) for node in with_camera(nodes, _settings(seed))]
     namespace = f"disk_{os.getpid()}"

@@ -23,9 +23,10 @@ setup(
         (f"share/{NAME}/bags/sample", sorted(glob("bags/sample/*"))),
     ],
     install_requires=["setuptools"],  # the rest: package.xml for rosdep, requirements/ for pip
-    extras_require={  # camera drivers, see docs/cameras.md; Aravis itself comes from the system
+    extras_require={  # camera drivers, see docs/cameras.md (Aravis itself comes from the system); a cluster
         "basler": ["pypylon==26.9"],
         "genicam": ["harvesters==1.4.3", "genicam==1.6.0"],
+        "dask": ["distributed==2026.8.0"],  # mems6dof analyze-many on several processes or machines
     },
     python_requires=">=3.10",
     zip_safe=False,

@@ -19,6 +19,7 @@ COMMANDS: Mapping[str, str | Mapping[str, str]] = {
     "calibrate-field": "mems6dof_ros.cli.calibrate_field",
     "scan": "mems6dof_ros.cli.scan",
     "analyze": "mems6dof_ros.cli.analyze",
+    "analyze-many": "mems6dof_ros.cli.analyze_many",
     "report": "mems6dof_ros.cli.report",
     "check": "mems6dof_ros.cli.check",
     "recover": "mems6dof_ros.cli.recover",

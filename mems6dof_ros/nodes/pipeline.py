@@ -49,6 +49,8 @@ class PipelineNode(frame_source.FrameSourceNode):
     def configure(self) -> None:
         self._localization = localizer.LocalizationOutput(self)
         self._pose = pose_estimator.PoseOutput(self)
+        if self._localization.tracker and len(self._pose.bodies) > 1:
+            raise InputError("parameter tracking.enabled", "several bodies", "false: it follows but one")
         super().configure()
 
     def _begin_when_ready(self) -> None:

@@ -104,10 +104,10 @@ class PoseOutput:
         self._cycles, self._valid = 0, Counter[str]()
         self._last_counter: int | None = None
         self._number, self._without_increment = CycleCount(), set[str]()
-        names = [estimator.body for estimator in self._bodies.estimators]
+        self.bodies = [estimator.body for estimator in self._bodies.estimators]
         self.publishers = {
             topic: node.create_publisher(messages.rclpy_type(kind), topic, transport.MESSAGES)
-            for topic, kind in pose_topics(names).items()
+            for topic, kind in pose_topics(self.bodies).items()
         }
         for name, act in (
             ("reset", self._reset),
@@ -149,7 +149,7 @@ class PoseOutput:
         if forget:
             self._reset()
         else:
-            self._without_increment = {estimator.body for estimator in self._bodies.estimators}
+            self._without_increment = set(self.bodies)
 
     def _as_counted(self, pose: CyclePose, cycle: int) -> CyclePose:
         """With the source's own ``cycle``; how many went by while it did not count, nobody knows."""
@@ -162,6 +162,7 @@ class PoseOutput:
 
     def _report(self, poses: list[CyclePose]) -> None:
         health, states = self._node.health, []
+        health.worked()
         for pose in poses:
             of = f"{pose.body} " if len(poses) > 1 else ""
             status = pose.status.name.lower()

@@ -75,3 +75,19 @@ def test_a_pipeline_needs_a_source_and_an_arrangement_a_name() -> None:
         SYSTEMS["live"].table({"source": "none", "arrangement": "pipeline"})
     with pytest.raises(InputError, match="processes or pipeline"):
         SYSTEMS["demo"].table({"arrangement": "threads"})
+
+
+def test_tracking_follows_but_one_body(tmp_path: Path, calibration: str) -> None:
+    bodies = tmp_path / "bodies.yaml"
+    bodies.write_text(
+        "bodies: {a: {region: {centre: [0, 0], outer_radius: 1.0e-5}},"
+        " b: {region: {centre: [2.0e-5, 0], outer_radius: 1.0e-5}}}"
+    )
+    nodes = chain(
+        simulated(2, **SMALL_GEAR), calibration=calibration, bodies=str(bodies), arrangement="pipeline"
+    )
+    nodes[0] = replace(nodes[0], parameters={**nodes[0].parameters, "tracking.enabled": True})
+    lines: list[str] = []
+    with run_system(nodes, on_line=lines.append) as system:
+        assert system.wait("pipeline", timeout=PATIENCE) == {"pipeline": 1}
+    assert "tracking.enabled: found several bodies" in "\n".join(lines)

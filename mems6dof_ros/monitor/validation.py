@@ -327,7 +327,7 @@ def _in_turns(
         "here": lambda url: _browsing(browser, url),
         "elsewhere": _reading,
     }
-    settle, length, rounds = (3.0, 6.0, 1) if quick else (5.0, 20.0, 4)
+    settle, length, rounds = (3.0, 6.0, 1) if quick else (5.0, 15.0, 3)
     with (
         poses.listening(namespace),
         run_system(nodes, namespace=namespace, on_line=lambda line: None) as running,
@@ -378,8 +378,9 @@ def _reading(url: str) -> Iterator[None]:
     async def read() -> None:
         async with aiohttp.ClientSession() as session, _page_socket(session, url) as socket:
             await socket.send_json({"type": "pictures", "on": True})
-            while not done.is_set():
-                message = await socket.receive(30)
+            async for message in socket:
+                if done.is_set():
+                    return
                 if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 2:
                     await socket.send_json({"type": "seen"})
 
@@ -589,8 +590,10 @@ def attacked(attack: Attack, token: str = "") -> tuple[bool, int, int]:
     url = server.start().partition("?")[0]
     done = threading.Event()
 
+    pose = machine.cycle(0, image=False)[2]
+    feed.add_pose(pose)
+
     def measure() -> None:
-        pose = machine.cycle(1, image=False)[2]
         for number in range(1, 100_000):
             if done.wait(1 / DRIVE):
                 return
@@ -601,8 +604,7 @@ def attacked(attack: Attack, token: str = "") -> tuple[bool, int, int]:
         cycles: list[int] = []
 
         async def watch(socket: Any) -> None:
-            while True:
-                message = await socket.receive()
+            async for message in socket:
                 if message.type is aiohttp.WSMsgType.BINARY and message.data[:4] == b"\x01\x00\x00\x00":
                     _, _, rows, columns = struct.unpack_from("<4I", message.data)
                     table = np.frombuffer(message.data, "<f8", offset=16).reshape(rows, columns)
@@ -617,6 +619,8 @@ def attacked(attack: Attack, token: str = "") -> tuple[bool, int, int]:
             while time.monotonic() < deadline and (not cycles or cycles[-1] < newest) and not watching.done():
                 await asyncio.sleep(0.02)
             watching.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await watching
         return refused, newest - cycles[0] + 1 - sum(cycle <= newest for cycle in cycles)
 
     measuring = threading.Thread(target=measure, daemon=True)

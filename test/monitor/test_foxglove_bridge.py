@@ -6,56 +6,18 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import struct
 from pathlib import Path
 
-import aiohttp
 import numpy as np
 import pytest
-from mcap.records import Schema
-from mcap_ros2.decoder import DecoderFactory
 from monitor_helpers import Instrument
 
+from mems6dof_ros.monitor.validation import foxglove_messages
 from mems6dof_ros.nodes.recorder import KNOWN_TYPES
 from mems6dof_ros.recording.definitions import typestore
 
 pytest.importorskip("foxglove", reason="the bridge is optional: foxglove-sdk is not installed")
 LAYOUT = Path(__file__).parents[2] / "config" / "foxglove-layout.json"
-
-
-async def collect(url: str, wanted: dict[str, int]) -> tuple[dict[str, dict], dict[str, list]]:
-    """Channels advertised, and so many decoded messages of each wanted topic."""
-    channels: dict[str, dict] = {}
-    decoded: dict[str, list] = {topic: [] for topic in wanted}
-    decoders, subscribed = {}, {}
-    async with (
-        aiohttp.ClientSession() as session,
-        session.ws_connect(url, protocols=["foxglove.sdk.v1"], max_msg_size=0) as socket,
-    ):
-        while any(len(decoded[topic]) < count for topic, count in wanted.items()):
-            message = await socket.receive(15)
-            if message.type is aiohttp.WSMsgType.TEXT:
-                told = json.loads(message.data)
-                for channel in told.get("channels", []):
-                    channels[channel["topic"]] = channel
-                for topic in wanted:
-                    if topic in channels and topic not in subscribed:
-                        channel = channels[topic]
-                        schema = Schema(
-                            1, channel["schema"].encode(), channel["schemaEncoding"], channel["schemaName"]
-                        )
-                        subscribed[topic] = len(subscribed)
-                        decoders[subscribed[topic]] = (
-                            topic,
-                            DecoderFactory().decoder_for(channel["encoding"], schema),
-                        )
-                        request = {"id": subscribed[topic], "channelId": channel["id"]}
-                        await socket.send_json({"op": "subscribe", "subscriptions": [request]})
-            elif message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
-                number, _ = struct.unpack_from("<IQ", message.data, 1)
-                topic, decode = decoders[number]
-                decoded[topic].append(decode(message.data[13:]))
-    return channels, decoded
 
 
 @pytest.fixture
@@ -73,7 +35,7 @@ def bridge():
 
 def test_an_independent_client_decodes_what_it_is_sent(bridge):
     wanted = {"/pose_6dof": 60, "/localizations": 20, "/frame_info": 20, "/image_raw": 2, "/diagnostics": 1}
-    channels, decoded = asyncio.run(collect(bridge.url, wanted))
+    channels, decoded = asyncio.run(foxglove_messages(bridge.url, wanted))
     assert {topic.lstrip("/") for topic in KNOWN_TYPES} == {topic.lstrip("/") for topic in channels}
     poses = decoded["/pose_6dof"]
     assert np.all(np.diff([pose.cycle for pose in poses]) == 1)

@@ -201,7 +201,9 @@ class PoseEstimator:
             self._half_field = np.array(s.field_size) / 2
         else:
             self._half_field = np.abs(view.position[:, :2]).max(axis=0, initial=1e-6)
-        field = self.field or FieldError.assumed(s, self._half_field)
+        # A chain of micrographs has no map from which a field error could be told.
+        field = self.field if s.reference == "map" and s.field_degree else None
+        field = field or FieldError.assumed(s, self._half_field)
         return Constellation(field, self.body, s.retire_after, s.overlap)
 
     # ----------------------------------------------------------------------------- tracking

@@ -31,7 +31,6 @@ class FieldError:
     def assumed(cls, settings: PoseSettings, half_size: Array) -> FieldError:
         """What ``settings`` assume, of the field that they state or of half-widths ``half_size`` (2,) m."""
         width, height = settings.field_size or 2 * half_size
-        # A chain of micrographs has no map from which the field error could be told.
         degree = settings.field_degree if settings.reference == "map" else 0
         modes = FieldModes((float(width) / 2, float(height) / 2), degree)
         return cls(modes, np.diag(modes.prior_variance(settings.field_sd_xy, settings.field_sd_z)))

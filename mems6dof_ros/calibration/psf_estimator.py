@@ -33,7 +33,7 @@ BRIGHT, TRUNCATION = 1e6, 0.3
 MOST_MODES, LEAST_MODE = 4, 0.1
 #: A second place is tried where its Gaussian shape is worse by less than this.
 _SECOND = 60.0
-#: Residual light relative to the calibration beads' that makes a fit poor, and where it does not matter yet.
+#: Misfit in units of the calibration beads' that makes a fit poor, and rms residual of no concern.
 _POOR, _LEAST_POOR = 4.0, 0.03
 _MOST_ORDER, _DEGREE = 5, 26
 _BACKGROUND = 10.0  # electrons per pixel, for weights only
@@ -125,7 +125,7 @@ class PsfEstimator:
         k = len(components.images)
         curves = components.curves.local(*place.T).reshape(len(z), 1 + components.modes, k, -1)
         parameters = np.empty((len(z), 5 + components.modes))
-        covariance, quality = np.empty((len(z), 3, 3)), np.empty((len(z), 3))
+        covariance, quality = np.empty((len(z), 3, 3)), np.empty((len(z), 4))
         maximise(
             pixels(image),
             *self._camera.maps,
@@ -135,6 +135,7 @@ class PsfEstimator:
             components.images,
             np.ascontiguousarray(curves),
             np.array(components.curves.interval),
+            model.misfit,
             parameters,
             covariance,
             quality,
@@ -156,9 +157,9 @@ class PsfEstimator:
             low, high = self._model.interval
             beyond = (u < low + sd) | (u > high - sd)
             beyond |= (u < self._z_range[0]) | (u > self._z_range[1])
-            _, chi_square, count = quality.T
-            misfit = np.sqrt(np.maximum(chi_square - count - 4 * np.sqrt(2 * count), 0) / flux)
-            poor = misfit > max(_POOR * self._model.misfit, _LEAST_POOR)
+            _, chi_square, count, signal = quality.T
+            usual = count + 4 * np.sqrt(2 * count) + (_POOR * self._model.misfit) ** 2 * signal
+            poor = chi_square > usual + _LEAST_POOR**2 * flux
             flags = np.where(z_gap < AMBIGUITY_GAP, Flag.Z_AMBIGUOUS, 0)
         flags |= np.where(beyond, Flag.Z_OUT_OF_RANGE, 0) | np.where(poor, Flag.POOR_FIT, 0)
         return np.asarray(flags | np.where(failed, Flag.NO_Z, 0), dtype=np.uint32)

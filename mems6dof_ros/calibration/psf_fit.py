@@ -53,8 +53,8 @@ class BeadWindows:
 
 @dataclass(frozen=True)
 class Retrieval:
-    """``parameters`` (COUNT,) of a bead, their ``covariance``, and ``misfit``: the rms residual beyond noise
-    relative to its light."""
+    """``parameters`` (COUNT,) of a bead, their ``covariance``, and ``misfit``: the relative error of the
+    model, beyond noise."""
 
     parameters: Array
     covariance: Array
@@ -129,7 +129,7 @@ class _Objective:
         image = found.image[cut].reshape(n, -1)
         jacobian = np.stack([column[cut].reshape(n, -1) for column in columns], axis=1)
         deviance, normal, gradient = 0.0, np.zeros((COUNT, COUNT)), np.zeros(COUNT)
-        self._light, self._pearson = 0.0, 0.0
+        self._excess, self._signal = 0.0, 0.0
         for data, unit, tangents in zip(self._data, image, jacobian, strict=True):
             linear = np.stack([unit, np.ones_like(unit)])
             mean = np.full(len(unit), max(float(data.mean()), _LEAST_MEAN))
@@ -145,11 +145,13 @@ class _Objective:
             overlap = (tangents * weight) @ linear.T
             normal += (tangents * weight) @ tangents.T - overlap @ np.linalg.solve(gram, overlap.T)
             gradient += tangents @ (weight * residual)
-            self._pearson += float(np.sum(weight * residual**2))
-            self._light += light
+            signal = np.maximum(light * unit, 0)
+            self._excess += float(np.sum(signal * (weight * residual**2 - 1)))
+            self._signal += float(np.sum(signal**3 * weight))
         return deviance, normal, gradient
 
     @property
     def misfit(self) -> float:
-        """Rms residual beyond noise relative to the light, at the last expansion."""
-        return float(np.sqrt(max(self._pearson - self._data.size, 0.0) / max(self._light, 1.0)))
+        """Relative error m of the model at the last expansion, where the light is: what is left over has the
+        variance of the noise plus (m signal)^2, weighted with the signal."""
+        return float(np.sqrt(max(self._excess, 0.0) / max(self._signal, 1e-12)))

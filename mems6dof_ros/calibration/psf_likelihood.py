@@ -8,7 +8,9 @@ transform is needed here:
 with the chief-ray slope s and the particle's own departures n, unit normal by construction: they are what
 the calibration saw particles differ in. Sub-pixel shifts use Lagrange interpolation of degree 5, ample
 for images band-limited to less than half of the sampling. Read noise counts as a Poisson number of
-its variance (Huang et al., Nat. Methods 10, 653, 2013); covariance is the inverse Fisher information.
+its variance (Huang et al., Nat. Methods 10, 653, 2013). Covariance is the inverse Fisher information F^-1,
+and where the model is wrong by the fraction e of the signal mu_s, in every pixel by itself,
+F^-1 + F^-1 M F^-1 with M = sum e^2 mu_s^2 / mu^2 (d mu)(d mu)'.
 """
 
 from __future__ import annotations
@@ -135,6 +137,7 @@ def maximise(
     components: Array,
     curves: Array,
     interval: Array,
+    misfit: float,
     parameters: Array,
     covariance: Array,
     quality: Array,
@@ -143,11 +146,11 @@ def maximise(
 
     ``starts`` (n, 3): column and row px, defocus m; ``slopes`` (n, 2) px/m; ``components`` (k, s, s) with
     s = window + 2 MARGIN; ``curves`` (n, 1 + m, k, d): Chebyshev coefficients of the amplitudes and of their
-    changes by each of m modes, over ``interval`` (2,) m. ``offset``, ``gain``, ``read_variance``: maps or
-    (1, 1).
+    changes by each of m modes, over ``interval`` (2,) m. ``misfit``: e, see above. ``offset``, ``gain``,
+    ``read_variance``: maps or (1, 1).
     Out: ``parameters`` (n, 5 + m): column, row, defocus m, light electrons, background, modes; NaN where it
-    fails; ``covariance`` (n, 3, 3) of the first three; ``quality`` (n, 3): deviance with the modes' prior,
-    Pearson's chi-square, number of pixels.
+    fails; ``covariance`` (n, 3, 3) of the first three; ``quality`` (n, 4): deviance with the modes' prior,
+    Pearson's chi-square, number of pixels, sum of mu_s^2 / mu.
     """
     count, groups, k_count, degree = curves.shape
     modes = groups - 1
@@ -339,6 +342,26 @@ def maximise(
         for p in range(3):
             for q in range(3):
                 covariance[i, p, q] = inverse[p, q]
+        # ``mean`` holds 1 / mu, ``tangent[3]`` the image of unit light.
+        signal = 0.0
+        for p in range(n_par):
+            for q in range(p + 1):
+                total = 0.0
+                for r in range(window):
+                    for c in range(window):
+                        s = light * unit[r, c] * mean[r, c]
+                        total += s * s * tangent[p, r, c] * tangent[q, r, c]
+                normal[p, q] = misfit * misfit * total
+                normal[q, p] = normal[p, q]
+        for r in range(window):
+            for c in range(window):
+                signal += light * light * unit[r, c] * unit[r, c] * mean[r, c]
+        for p in range(3):
+            for q in range(3):
+                for a in range(n_par):
+                    for b in range(n_par):
+                        covariance[i, p, q] += inverse[p, a] * normal[a, b] * inverse[b, q]
+        quality[i, 3] = signal
         quality[i, 0] = deviance - expected
         quality[i, 1] = chi
         quality[i, 2] = pixels

@@ -45,8 +45,8 @@ class PsfModel:
     (2, Zernike terms) rad of the chief ray; both on a disc of ``radius`` m, filled up with zeros where a
     term needs a lower order. ``ln_diameter``: of the mean diameter over the nominal one. ``focus``: z of
     zero defocus, ``focus_variance`` m^2. ``scatter`` (terms + 1, terms + 1): covariance of single particles'
-    coefficients and ln diameter. ``interval`` m: defocus that the beads covered. ``misfit``: rms of what the
-    beads' images differ from the model beyond noise, relative to their light.
+    coefficients and ln diameter. ``interval`` m: defocus that the beads covered. ``misfit``: relative
+    error of the model where the beads' light is, beyond noise.
     """
 
     imaging: Imaging

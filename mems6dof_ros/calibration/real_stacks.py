@@ -113,6 +113,8 @@ def _through_focus(
     """z against the stage of every bead in every plane (b, p) m about the bead's mean, NaN beyond ``reach``;
     claimed sd; which have no flag."""
     shape = len(stack.beads), len(planes)
+    psf = calibration.psf if calibration.method == "psf" else None
+    surface = (psf or calibration.model).focus_variance
     z, sd, good = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     for plane, frame in enumerate(planes):
         at = [
@@ -132,9 +134,11 @@ def _through_focus(
         )
         found = calibration.locate(fits, frame.image)
         z[beads, plane] = found.position[:, 2] + frame.stage_z
-        sd[beads, plane] = np.sqrt(found.covariance[:, 2, 2])
+        # Own heights are taken off, and with them what the focus surface is uncertain by.
+        sd[beads, plane] = np.sqrt(found.covariance[:, 2, 2] - surface)
         good[beads, plane] = found.flags == 0
-    return z - np.nanmean(np.where(good, z, np.nan), axis=1, keepdims=True), sd, good
+    count = np.maximum(good.sum(axis=1, keepdims=True), 1)
+    return z - np.sum(np.where(good, z, 0.0), axis=1, keepdims=True) / count, sd, good
 
 
 def one_plane_left_out(stack: FocusStack, reach: float, orders: Orders) -> StageErrors:

@@ -144,11 +144,21 @@ def errors(calibration: Calibration, particles: Sequence[Particles]) -> Errors:
     )
     position = np.concatenate([p.position for p in particles])
     error = np.concatenate([f.position for f in found])[good] - position[good]
-    sd = np.sqrt(np.concatenate([np.einsum("nkk->nk", f.covariance) for f in found])[good])
+    variance = np.concatenate([np.einsum("nkk->nk", f.covariance) for f in found])[good]
+    variance[:, 2] -= _plane_variance(calibration)
+    sd = np.sqrt(variance)
     plane = np.column_stack([np.ones(len(error)), position[good, :2]])
     error[:, 2] -= plane @ np.linalg.lstsq(plane, error[:, 2], rcond=None)[0]
     error[:, :2] -= error[:, :2].mean(axis=0)
     return Errors(error, sd, position[good], len(good))
+
+
+def _plane_variance(calibration: Calibration) -> float:
+    """What a plane contributes to the uncertain height of the focus surface, m^2: taken off with it."""
+    psf = calibration.psf if calibration.method == "psf" else None
+    surface = psf or calibration.model
+    terms = len(surface.focus.coefficients)
+    return surface.focus_variance * min(3, terms) / terms
 
 
 def pooled(parts: Sequence[Errors]) -> Errors:

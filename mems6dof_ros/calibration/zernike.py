@@ -8,6 +8,7 @@ corners, so on the square field with its random beads the terms are smooth but n
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +35,14 @@ def zernike(order: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArr
         for m in range(-n, n + 1, 2):
             angular = azimuthal[abs(m)].imag if m < 0 else azimuthal[abs(m)].real
             norm = math.sqrt(n + 1) if m == 0 else math.sqrt(2 * (n + 1))
-            terms.append(norm * np.polyval(_radial_coefficients(n, abs(m)), radius2) * angular)
+            radial, *lower = _radial_coefficients(n, abs(m))
+            for coefficient in lower:
+                radial = radial * radius2 + coefficient
+            terms.append(norm * radial * angular)
     return np.stack(terms, axis=1)
 
 
+@lru_cache(maxsize=256)
 def _radial_coefficients(n: int, m: int) -> list[float]:
     """Coefficients of R_n^m(r) / r^m in powers of r^2, highest first."""
     return [

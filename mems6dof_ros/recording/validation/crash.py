@@ -67,11 +67,11 @@ def die(work: Path, seed: int, kills: int, size: int, rate: float) -> Iterator[D
     namespace = f"crash_{os.getpid()}"
     bag, noted = work / "bag", work / "journal"
     work.mkdir(parents=True)
-    with traffic(namespace, rate, size):
+    with traffic(namespace, rate, size) as publisher:
         for _ in range(kills):
             shutil.rmtree(bag, ignore_errors=True)
             with witnessed_recorder(namespace, bag, noted, split_duration=0.7) as (process, journal):
-                until(lambda: len(journal.written[0]), "message recorded", process)
+                until(lambda: len(journal.written[0]), "message recorded", process, publisher)
                 time.sleep(rng.uniform(0.05, 1.5))
                 killed = kill(process)
             yield _examine(bag, journal, killed)

@@ -21,10 +21,10 @@ TOPICS = [topic for _, topic in CYCLE]
 
 
 @contextmanager
-def traffic(namespace: str, rate: float, size: int) -> Iterator[None]:
+def traffic(namespace: str, rate: float, size: int) -> Iterator[subprocess.Popen[str]]:
     """``rate`` cycles per second with frames of ``size`` px, as long as the context lasts."""
-    with _module("traffic", [f"{rate}", f"{size}"], namespace, {}):
-        yield
+    with _module("traffic", [f"{rate}", f"{size}"], namespace, {}) as process:
+        yield process
 
 
 @contextmanager
@@ -57,14 +57,14 @@ def _module(
             raise Mems6dofError(f"{what} ended with {process.returncode}: {said.strip()[-300:]}")
 
 
-def until(
-    condition: Callable[[], Any], what: str, process: subprocess.Popen[str], timeout: float = 60.0
-) -> None:
-    """Poll; Mems6dofError after ``timeout`` s, or when ``process`` has ended."""
-    deadline = time.monotonic() + timeout
+def until(condition: Callable[[], Any], what: str, *processes: subprocess.Popen[str]) -> None:
+    """Poll; Mems6dofError after a minute, or when one of ``processes`` has ended."""
+    deadline = time.monotonic() + 60.0
     while not condition():
-        if time.monotonic() > deadline or process.poll() is not None:
-            raise Mems6dofError(f"no {what} within {timeout:g} s")
+        if any(process.poll() is not None for process in processes):
+            raise Mems6dofError(f"no {what}: a process has ended")
+        if time.monotonic() > deadline:
+            raise Mems6dofError(f"no {what} within a minute")
         time.sleep(0.01)
 
 

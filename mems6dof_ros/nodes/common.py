@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import gc
+import math
 import os
 import signal
 import sys
@@ -50,6 +51,10 @@ WAIT_PARAMETER = Parameter(
     "Publish nothing before these nodes subscribe to these topics, so that none misses the beginning: a"
     " list of topic:node; or topic:number, so many of whatever name.",
 )
+#: Fraction of a queue from which it is a concern.
+_FULL = 0.8
+#: Seconds of waiting for others after which it is a concern.
+_PATIENCE = 10.0
 
 
 class WhileRoom(CallbackGroup):
@@ -86,12 +91,13 @@ class InstrumentNode(ManagedNode):
         self.finished = threading.Event()
         self.failure: BaseException | None = None
         self._rehearsal: threading.Thread | None = None
+        self._waiting_since = math.inf  # monotonic s; infinite: for nobody
+        self.health.watch("readiness", self._waiting_concern)
+        self.health.watch("queue", self._queue_concern)
 
     def entered(self, state: str) -> None:
-        self.health.lifecycle = state
+        self.health.entered(state)
         self.get_logger().info(state)
-        if state != "active":  # what was true then
-            self.health.state = ""
         if state == "finalized":
             self.finished.set()
 
@@ -143,6 +149,14 @@ class InstrumentNode(ManagedNode):
         self.stream = Stream(self, failed, tick)
         return self.stream
 
+    def _waiting_concern(self) -> str:
+        late = self.lifecycle == "active" and time.monotonic() - self._waiting_since > _PATIENCE
+        return f"active: {self.health.state}" if late else ""
+
+    def _queue_concern(self) -> str:
+        fill = self.worker.fill if self.worker else 0.0
+        return f"the queue is {fill:.0%} full" if fill > _FULL else ""
+
     def when_ready(
         self,
         waiting_for: Callable[[], str],
@@ -156,6 +170,7 @@ class InstrumentNode(ManagedNode):
         thread: it computes what nobody sees, so that the first message does not wait for the compiler.
         """
         tell_at, interval = 0.0, 5.0
+        self._waiting_since = time.monotonic()
 
         def compile_kernels() -> None:
             try:
@@ -177,6 +192,7 @@ class InstrumentNode(ManagedNode):
                     tell_at, interval = time.monotonic() + interval, 2 * interval
                 return
             timer.cancel()
+            self._waiting_since = math.inf
             gc.collect()
             gc.freeze()  # what is there by now stays; to look through it again takes 50 ms now and then
             act()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import threading
 import time
@@ -19,11 +20,13 @@ from mems6dof_ros.nodes import transport
 class Health:
     """Counts and times of a node, published on /diagnostics once per second; safe for any thread.
 
-    The level is WARN while something was lost, ERROR while something was refused, in the last second, and
-    ERROR as long as ``failure`` says what keeps the node from its work.
+    The level is WARN while something was lost, ERROR while something was refused, in the last second; ERROR
+    as long as ``failure`` says what keeps the node from its work, WARN as long as something that is watched
+    has a concern, and STALE when an active node that had ``worked`` has not for STALE_AFTER.
     """
 
     PERIOD = 1.0  # s
+    STALE_AFTER = 5.0  # s
     MOST_LINES = 10  # that are logged of the problems of one period
 
     def __init__(self, node: Node) -> None:
@@ -38,6 +41,8 @@ class Health:
         self._values: dict[str, str] = {}
         self._problems: list[tuple[bytes, str]] = []
         self._gauges: dict[str, Callable[[], Any]] = {}
+        self._watched: dict[str, Callable[[], str]] = {}
+        self._worked = math.inf  # monotonic s; infinite: not since it became active
         self._since = time.monotonic()
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", transport.MESSAGES)
         # Wall time: with use_sim_time and no clock, diagnostics must still say so.
@@ -66,6 +71,20 @@ class Health:
     def gauge(self, what: str, read: Callable[[], Any]) -> None:
         """Have ``read`` called for every report."""
         self._gauges[what] = read
+
+    def watch(self, what: str, concern: Callable[[], str]) -> None:
+        """Have ``concern`` called for every report; it says why to worry about ``what``, or nothing."""
+        self._watched[what] = concern
+
+    def worked(self) -> None:
+        """The node has done what it is there for, and is expected to go on."""
+        self._worked = time.monotonic()
+
+    def entered(self, lifecycle: str) -> None:
+        """The node has changed to the state with this label."""
+        self.lifecycle, self._worked = lifecycle, math.inf
+        if lifecycle != "active":  # what was true then
+            self.state = ""
 
     def lost(self, number: int, why: str) -> None:
         """Something was lost: count it and warn."""
@@ -108,8 +127,11 @@ class Health:
         values.update({what: str(read()) for what, read in self._gauges.items()})
         values["lifecycle"] = self.lifecycle
         state = f"{self.lifecycle}: {self.state}" if self.state else self.lifecycle
+        problems += [(DiagnosticStatus.WARN, text) for read in self._watched.values() if (text := read())]
         if self.failure:
             problems = [(DiagnosticStatus.ERROR, self.failure)]
+        if not problems and (idle := now - self._worked) > self.STALE_AFTER:
+            problems = [(DiagnosticStatus.STALE, f"nothing to do for {idle:.0f} s; {state}")]
         level, message = max(problems, default=(DiagnosticStatus.OK, state), key=lambda p: p[0])
         status = DiagnosticStatus(
             level=level,

@@ -138,6 +138,7 @@ class LocalizationOutput:
         if self._points.get_subscription_count():
             self._points.publish(point_cloud(found))
         health = self._node.health
+        health.worked()
         health.count("frames localized")
         health.set("particles", len(found))
         health.time("localization", found.latency.localization)

@@ -42,6 +42,11 @@ class Worker(Generic[Item]):
     def __len__(self) -> int:
         return len(self._items)
 
+    @property
+    def fill(self) -> float:
+        """Fraction of the capacity that is taken."""
+        return self._waiting / self._capacity
+
     def accepts(self) -> bool:
         """False while ``put`` would block."""
         return self._policy != "block" or self._ending or self._waiting < self._capacity

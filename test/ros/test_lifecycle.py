@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from peers import SMALL_GEAR, NodeProcess, Peer
@@ -182,3 +183,19 @@ def test_the_recorder_completes_its_bag_when_deactivated(start: Start, peer: Pee
     peer.wait(lambda: notes.get_subscription_count() == 1)
     assert node.stop() == 0
     assert (tmp_path / "bag_1" / "metadata.yaml").is_file()
+
+
+def test_diagnostics_worry_about_nodes_that_wait_and_streams_that_stop(start: Start, peer: Peer) -> None:
+    peer.listen(DiagnosticArray, "/diagnostics")
+    start_node(start, "pose_estimator")
+    start_node(start, "controller")  # waits for a drive that does not come
+
+    def told(node: str, level: bytes, text: str) -> bool:
+        statuses = [s for message in peer.received["/diagnostics"] for s in message.status]
+        return any(s.name == node and s.level == level and text in s.message for s in statuses)
+
+    peer.publisher(Localizations, "localizations").publish(Localizations(frame_counter=1, cycle=1))
+    peer.wait(lambda: told("pose_estimator", DiagnosticStatus.OK, "active: initializing"))
+    peer.wait(lambda: told("pose_estimator", DiagnosticStatus.STALE, "nothing to do for"))
+    assert told("controller", DiagnosticStatus.OK, "active: waiting for a drive")
+    peer.wait(lambda: told("controller", DiagnosticStatus.WARN, "active: waiting for a drive"))

@@ -169,9 +169,14 @@ def _open_tiff(path: Path) -> tuple[int, Callable[[int], Pixels], float, float]:
 
 
 def _read_by_opencv(path: Path, k: int) -> Pixels | None:
+    """Image ``k`` of a file, None where OpenCV cannot read it; it throws where the sizes are absurd."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    _, images = cv2.imreadmulti(str(path), k, 1, flags=cv2.IMREAD_UNCHANGED)
-    cv2.utils.logging.setLogLevel(level)
+    try:
+        _, images = cv2.imreadmulti(str(path), k, 1, flags=cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     return images[0] if images else None
 
 

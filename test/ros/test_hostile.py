@@ -1,0 +1,28 @@
+"""The rows of `mems6dof validate lab` about broken messages, in short."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from peers import SMALL_GEAR
+
+from mems6dof_ros.nodes import hostile
+from mems6dof_ros.simulation.settings import SimulationSettings
+
+SETTINGS = SimulationSettings(**SMALL_GEAR)
+
+
+def assert_passed(rows: list[hostile.Figure], least: int) -> None:
+    verdicts = [row["passed"] for row in rows if row["passed"] is not None]
+    assert len(verdicts) >= least
+    assert all(verdicts), rows
+
+
+def test_broken_frames_and_localizations_change_no_pose(calibration: str, tmp_path: Path) -> None:
+    assert_passed(list(hostile.broken_frames(SETTINGS, Path(calibration), 16, tmp_path)), 9)
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_nonsense_on_every_topic_ends_no_node(calibration: str, tmp_path: Path, seed: int) -> None:
+    assert_passed(list(hostile.fuzzed_topics(SETTINGS, Path(calibration), 4, seed, tmp_path)), 5)

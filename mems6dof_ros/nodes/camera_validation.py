@@ -142,6 +142,8 @@ def poses(seconds: float, size: int, rate: float) -> Iterator[Figure]:
     yield _exact("produced - published - reported lost", produced - len(infos) - lost, 0)
     yield _exact("stamps that do not ascend", sum(b <= a for a, b in pairwise(watched.stamps)), 0)
     yield _information("frames that the localizer could not keep up with, counted", unmeasured)
+    unaccounted = produced - len(measured) - unmeasured
+    yield _information("frames without a pose that are not counted yet", unaccounted)
     yield _information("poses per second", len(measured) / duration)
     yield _exact("poses that are not valid", len(measured) - len(valid), 0)
     yield _figure("psi against truth, rms, rad", errors, "< 1e-4", errors < 1e-4)

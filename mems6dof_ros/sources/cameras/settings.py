@@ -41,7 +41,7 @@ class CameraSettings:
     trigger: str = _setting(
         "off",
         "",
-        "off; software: at frame_rate, or where that is not given at each call of trigger(); or the name of"
+        "off; software: at frame_rate, or where that is not given at each call of ~/trigger; or the name of"
         " the camera's input, such as Line1: a frame per pulse",
     )
     timestamp_at: str = _setting(

@@ -43,7 +43,6 @@ from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter, of_settings
 from mems6dof_ros.nodes.schedule import Schedule
 from mems6dof_ros.nodes.stage import serve_stage
-from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.cameras.camera import CameraSource
@@ -178,6 +177,8 @@ PARAMETERS = (
     *camera_parameters(),
 )
 
+_LONGEST_READ = 30.0  # s; a simulator renders a full frame in much less, a device answers within 1 s
+
 
 class State(enum.Enum):
     """See the module."""
@@ -252,9 +253,11 @@ class FrameSourceNode(InstrumentNode):
             self._abandon = True
             self._changed.notify_all()
         if self._thread.is_alive():
-            self._thread.join(DRAIN_TIMEOUT)
+            self._thread.join(_LONGEST_READ)
         if self._thread.is_alive():
-            raise Mems6dofError(f"the source {self.values['source']} does not let go")
+            raise Mems6dofError(
+                f"the source {self.values['source']} is still busy with a frame after {_LONGEST_READ:g} s"
+            )
         if self._state in (State.RUNNING, State.STOPPED):
             self._begin_as, self._state = self._state, State.WAITING
         super().deactivate()

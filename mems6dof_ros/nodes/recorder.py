@@ -34,6 +34,7 @@ from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import COMPRESSIONS, BagWriter, Channel, Qos
+from mems6dof_ros.recording.definitions import definition
 from mems6dof_ros.recording.recover import interrupted
 
 #: Types of the topics that we know before anybody publishes them.
@@ -203,6 +204,7 @@ class RecorderNode(InstrumentNode):
             self._looking.cancel()
 
     def _subscribe(self, name: str, typename: str, qos: QoSProfile) -> None:
+        definition(typename)  # fails here rather than with the first message
         module, _, kind = typename.rpartition("/")
         message_type = getattr(importlib.import_module(module.replace("/", ".")), kind)
         offered = Qos(
@@ -309,12 +311,14 @@ class RecorderNode(InstrumentNode):
                 self._between.append((functools.partial(_attach, name=name, text=text), Future()))
 
     def _tell_of_disk(self, bag: BagWriter) -> None:
-        free = shutil.disk_usage(bag.path).free - self.values["minimum_free_mebibytes"] * _MEBIBYTE
-        before, self._bytes = self._bytes, self.health.total("bytes")
+        with contextlib.suppress(OSError):  # it is gone, as the worker will find
+            free = shutil.disk_usage(bag.path).free // _MEBIBYTE - self.values["minimum_free_mebibytes"]
+            self.health.set("disk, MiB left to record", free)
+            before, self._bytes = self._bytes, self.health.total("bytes")
+            if self._bytes > before:
+                minutes = free * _MEBIBYTE / (self._bytes - before) / 60.0
+                self.health.set("disk, min until it is full", round(minutes))
         self.health.set("file", bag.file)
-        self.health.set("disk, MiB left to record", free // _MEBIBYTE)
-        if self._bytes > before:
-            self.health.set("disk, min until it is full", round(free / (self._bytes - before) / 60.0))
 
     def _next_path(self) -> str:
         """Where to record: ``output``, or beside it where this node has recorded there, or one was killed."""
@@ -375,9 +379,10 @@ class RecorderNode(InstrumentNode):
         return response
 
     async def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not self._bag:
+        if self._bag is None:
             response.success, response.message = False, self.health.failure or "not recording"
             return response
+        path = self._bag.path
         await self._quiet()  # what was sent before this call may still be on its way through our callbacks
         bag, self._bag = self._bag, None
         if bag and self.worker is not None:  # not failed or deactivated meanwhile
@@ -389,7 +394,7 @@ class RecorderNode(InstrumentNode):
 
             self.worker.put(close, 0)  # behind what is queued, of which no more comes
             await closing
-        response.success, response.message = not self.health.failure, self.health.failure or str(bag.path)
+        response.success, response.message = not self.health.failure, self.health.failure or str(path)
         self.tell("stopped")
         return response
 

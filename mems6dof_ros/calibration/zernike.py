@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ def zernike(order: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArr
         for m in range(-n, n + 1, 2):
             angular = azimuthal[abs(m)].imag if m < 0 else azimuthal[abs(m)].real
             norm = math.sqrt(n + 1) if m == 0 else math.sqrt(2 * (n + 1))
+            radial: Any
             radial, *lower = _radial_coefficients(n, abs(m))
             for coefficient in lower:
                 radial = radial * radius2 + coefficient

@@ -12,12 +12,11 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import check_image
 from mems6dof_ros.localization import detection_kernels
-from mems6dof_ros.localization.kernels import pixels
+from mems6dof_ros.localization.kernels import close_pairs, pixels
 
 Cells: TypeAlias = NDArray[np.float32]
 
@@ -163,8 +162,7 @@ def _vertex(score: NDArray[np.float32], rows: NDArray, columns: NDArray, down: i
 def _separated(positions: NDArray[np.float64], separation: float) -> NDArray[np.bool_]:
     """Which of the positions, best first, have no better one that stays within ``separation``."""
     stays = np.ones(len(positions), dtype=bool)
-    if len(positions):
-        for better, worse in sorted(cKDTree(positions).query_pairs(separation)):
-            if stays[better]:
-                stays[worse] = False
+    for better, worse in close_pairs(positions, separation):
+        if stays[better]:
+            stays[worse] = False
     return stays

@@ -896,3 +896,31 @@ def residual_sums(
                 for k in range(j + 1):
                     s += _BINOMIAL[j][k] * dy ** (j - k) * raw[k]
                 sums[n, i, j] = s
+
+
+@njit(**_OPTIONS)
+def close_pairs(positions: Array, distance: float) -> NDArray[np.int64]:
+    """Pairs a < b (k, 2), in their order, of the ``positions`` (n, 2) that are within ``distance``.
+
+    A sweep along x: for the hundred particles of a frame faster than to build a tree.
+    """
+    order = np.argsort(positions[:, 0], kind="mergesort")
+    count, room = 0, 4 * len(positions)
+    found = np.empty(room, np.int64)
+    for i in range(len(order)):
+        a = order[i]
+        for j in range(i + 1, len(order)):
+            b = order[j]
+            dx, dy = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1]
+            if dx > distance:
+                break
+            if dx * dx + dy * dy <= distance * distance:
+                if count == room:
+                    found, room = np.concatenate((found, found)), 2 * room
+                found[count] = min(a, b) * len(order) + max(a, b)
+                count += 1
+    sorted_pairs = np.sort(found[:count])
+    pairs = np.empty((count, 2), np.int64)
+    for k in range(count):
+        pairs[k, 0], pairs[k, 1] = sorted_pairs[k] // len(order), sorted_pairs[k] % len(order)
+    return pairs

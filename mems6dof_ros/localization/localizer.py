@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mems6dof_ros.calibration.interface import OpticalCalibration, Positions
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
+from mems6dof_ros.localization import kernels
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.detection import DetectionSettings, detect
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, check_fit, fit_gaussians
@@ -171,7 +171,7 @@ def _first_of_each(fits: GaussianFits, distance_px: float) -> NDArray[np.bool_]:
     """Without the fits that have wandered to a particle that an earlier candidate found."""
     first = np.ones(len(fits), dtype=bool)
     good = np.nonzero((fits.flags & Flag.FIT_FAILED) == 0)[0]
-    for a, b in sorted(cKDTree(fits.parameters[good, :2]).query_pairs(distance_px)):
+    for a, b in kernels.close_pairs(fits.parameters[good, :2], distance_px):
         if first[good[a]]:
             first[good[b]] = False
     return first
@@ -181,7 +181,7 @@ def _disturbed(fits: GaussianFits, distance_px: float, least_flux: float) -> NDA
     """Fits with a neighbour within ``distance_px`` that has at least ``least_flux`` of their light."""
     disturbed = np.zeros(len(fits), dtype=bool)
     good = np.nonzero((fits.flags & Flag.FIT_FAILED) == 0)[0]
-    pairs = cKDTree(fits.parameters[good, :2]).query_pairs(distance_px, output_type="ndarray")
+    pairs = kernels.close_pairs(fits.parameters[good, :2], distance_px)
     a, b = good[pairs[:, 0]], good[pairs[:, 1]]
     flux = fits.flux
     disturbed[a[flux[b] > least_flux * flux[a]]] = True

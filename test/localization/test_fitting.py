@@ -5,11 +5,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import KAPPA, WEIGHTINGS, fit_gaussians
 from mems6dof_ros.localization.gaussian import cramer_rao, gaussian, pixel_grid, reference_fit, window_weights
+from mems6dof_ros.localization.kernels import close_pairs
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 from mems6dof_ros.localization.validation import matched_field, physical_field
 
@@ -233,3 +235,10 @@ def test_unusable_input_is_refused(change: dict, named: str) -> None:
     values = {"image": np.zeros((50, 50), np.uint16), "positions_px": [[25, 25]], "camera": PERFECT}
     with pytest.raises(InputError, match=named):
         fit_gaussians(**(values | change))
+
+
+@pytest.mark.parametrize("count", [0, 1, 100, 1000])
+def test_close_pairs_are_those_of_a_tree(count: int) -> None:
+    positions = np.random.default_rng(count).uniform(0, 100, (count, 2))
+    expected = sorted(cKDTree(positions).query_pairs(7.0)) if count else []
+    np.testing.assert_array_equal(close_pairs(positions, 7.0), np.array(expected).reshape(-1, 2))

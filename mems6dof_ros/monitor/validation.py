@@ -87,7 +87,10 @@ def chromium() -> Iterator[Any]:
             browser = library.chromium.launch(executable_path=path, args=arguments)
         except Error as error:
             raise Mems6dofError(f"no browser: install one of {', '.join(names)}") from error
-        yield browser
+        try:
+            yield browser
+        except Error as error:
+            raise Mems6dofError(f"browser: {error.message.splitlines()[0]}") from error
         browser.close()
 
 
@@ -213,10 +216,12 @@ def _press(shown: Any, work: Path) -> int:
     for service in _SERVICES:
         shown.wait_for_selector(f"[data-service='{service}']:enabled")
         shown.click(f"[data-service='{service}']")
+        # An answer, or that there is none within the time that the page allows.
         shown.wait_for_function(
-            "service => document.getElementById('answer').textContent === `✓ ${service} done`", arg=service
+            "service => document.getElementById('answer').textContent.match(`✓ ${service}|✗`)", arg=service
         )
-        done += 1
+        done += shown.inner_text("#answer") == f"✓ {service} done"
+        shown.evaluate("document.getElementById('answer').textContent = ''")
         if service == "frame_source/stop":
             shown.wait_for_function("() => document.getElementById('status-name').textContent === 'STALE'")
     shown.click("[data-window='80']")

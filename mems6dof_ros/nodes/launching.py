@@ -33,6 +33,7 @@ def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
     from launch.actions import Shutdown
     from launch_ros.actions import Node
 
+    grace, grace_after = RunningSystem.GRACE
     files = [os.fspath(Path(config) / f"{spec.executable}.yaml")] if config else []
     return Node(
         package="mems6dof_ros",
@@ -47,4 +48,6 @@ def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
         on_exit=Shutdown() if finite else None,
         respawn=spec.respawn,
         respawn_delay=RunningSystem.RESPAWN_DELAY,
+        sigterm_timeout=str(grace),  # launch's own 5 s may be too short for a recorder and its disk
+        sigkill_timeout=str(grace_after),
     )

@@ -99,6 +99,8 @@ def one_bead_left_out(
             common = np.full(z.shape[1], np.nan)
             common[seen] = np.nanmedian(z[rest][:, seen], axis=0)
             here = np.isfinite(z[index]) & np.isfinite(common)
+            if (used := here & good[index]).any():  # the bead's own height against the others'
+                common += np.mean((z[index] - common)[used])
             found[name].append((z[index, here], sd[index, here], common[here], good[index, here]))
     results = {}
     for name, parts in found.items():

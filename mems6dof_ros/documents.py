@@ -12,6 +12,7 @@ import yaml
 from mems6dof_ros.errors import InputError
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DEEPEST = 100  # levels
 _PARSERS: Mapping[str, Callable[[str], Any]] = {
     "YAML": lambda text: yaml.load(text, Loader=_LOADER),
     "JSON": json.loads,
@@ -38,21 +39,19 @@ def read_document(path: str | Path, language: str, expected: str) -> Any:
     except (yaml.YAMLError, ValueError) as error:
         reason = str(error).partition("\n")[0]
         raise InputError(where, f"no valid {language} ({reason})", expected) from None
-    if not _fits(content, 1 + len(text)):
-        raise InputError(where, "references that multiply beyond the file", expected)
+    _check_size(content, 1 + len(text), where, expected)
     return content
 
 
-def _fits(content: Any, limit: int) -> bool:
-    """Has it no more values than the file has characters?"""
-    pending = [content]
+def _check_size(content: Any, limit: int, where: str, expected: str) -> None:
+    """Refuse more values than the file has characters, and more levels than anybody writes."""
+    pending = [(content, 0)]
     while pending:
+        node, depth = pending.pop()
         limit -= 1
         if limit < 0:
-            return False
-        node = pending.pop()
-        if isinstance(node, dict):
-            pending += node.values()
-        elif isinstance(node, list):
-            pending += node
-    return True
+            raise InputError(where, "references that multiply beyond the file", expected)
+        if depth > _DEEPEST:
+            raise InputError(where, "values nested too deeply", expected)
+        inside = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+        pending += [(value, depth + 1) for value in inside]

@@ -20,6 +20,7 @@ BOMB = "\n".join(
         ("YAML", b"\xff\xfe\x00", "no text"),
         ("YAML", b"[" * 20_000, "nested too deeply|no valid YAML"),
         ("YAML", BOMB.encode(), "references that multiply"),
+        ("YAML", b"[" * 200 + b"]" * 200, "nested too deeply"),
         ("JSON", b"{", "no valid JSON"),
         ("JSON", b"[" * 200_000, "nested too deeply"),
         ("JSON", b"9" * 100_000, "no valid JSON"),

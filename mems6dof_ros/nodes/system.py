@@ -475,7 +475,7 @@ def run_system(
     """Start the nodes as processes, and stop them all at the end of the context, however it ends.
 
     ``config``: directory of parameter files; ``environment``: for variables that ours does not set, by
-    default discovery limited to this machine; ``prefix``: of the command of each, which it must become by exec;
+    default discovery limited to this machine; ``prefix``: put before the command of each;
     ``on_line`` gets every line they print, with the node's name.
     """
     readers = []

@@ -13,6 +13,7 @@ from typing import Any
 
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.common import PARENT_VARIABLE
 from mems6dof_ros.nodes.parameters import to_yaml
 from mems6dof_ros.nodes.shared_memory import remove_abandoned
 from mems6dof_ros.recording.validation.traffic import CYCLE, Journal
@@ -46,7 +47,7 @@ def _module(
     command += ["--ros-args", "-r", f"__ns:=/{namespace}", "--log-level", "error"]
     for name, value in parameters.items():
         command += ["-p", f"{name}:={to_yaml(value)}"]
-    environment = {**transport.LOCALHOST_ONLY, **os.environ}
+    environment = {**transport.LOCALHOST_ONLY, **os.environ, PARENT_VARIABLE: str(os.getpid())}
     process = subprocess.Popen(command, env=environment, text=True, stderr=subprocess.PIPE)
     try:
         yield process

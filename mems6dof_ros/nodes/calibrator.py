@@ -58,6 +58,14 @@ PARAMETERS = (
         for name, (unit, doc) in CAMERA_NOISE.items()
     ),
     Parameter("pixel_size", NAN, "Pixel size in object space where frames do not tell.", "m", optional=True),
+    Parameter(
+        "wavelength",
+        NAN,
+        "Of the emission: with bead_diameter, and the aperture in the goal, method psf is calibrated too.",
+        "m",
+        optional=True,
+    ),
+    Parameter("bead_diameter", NAN, "Of the beads.", "m", optional=True),
     Parameter("window_px", DEFAULT_WINDOW_PX, "Odd side of the fitted window.", "px", (5, 255)),
     Parameter("weighting", DEFAULT_WEIGHTING, "Weights of the fit.", choices=tuple(WEIGHTINGS)),
     Parameter("stage_timeout", 30.0, "Longest that the stage may take to a position.", "s", (0.1, 3600.0)),
@@ -256,6 +264,8 @@ class _Goal:
         settings = CalibrationSettings(
             axial_range=asked.axial_range or None,
             numerical_aperture=asked.numerical_aperture or None,
+            wavelength=self._known("wavelength"),
+            bead_diameter=self._known("bead_diameter"),
             rotations=tuple(asked.rotations) or None,
         )
         self._tell("modelling", 0, 0)
@@ -272,6 +282,10 @@ class _Goal:
             warnings=list(result.warnings),
             report=str(report),
         )
+
+    def _known(self, name: str) -> float | None:
+        value = self._values[name]
+        return None if math.isnan(value) else float(value)
 
     def check(self) -> None:
         """Raise Cancelled where the goal is no longer wanted."""

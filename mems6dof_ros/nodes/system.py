@@ -251,8 +251,10 @@ def _calibrate(values: Mapping[str, str]) -> list[NodeSpec]:
         "simulator.seed": int(values["seed"]),
         "simulator.optics_seed": int(values["optics_seed"]),
     }
-    noise = json.loads(camera_to_json(camera_noise(SimulationSettings())))
+    simulation = SimulationSettings()
+    noise = json.loads(camera_to_json(camera_noise(simulation)))
     known = {f"camera.{name}": float(value) for name, value in noise.items()}
+    known |= {"wavelength": simulation.wavelength, "bead_diameter": simulation.diameter}
     return [NodeSpec("frame_source", camera | simulated_substrate), replace(calibrator, parameters=known)]
 
 

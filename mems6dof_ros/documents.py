@@ -1,7 +1,8 @@
-"""Text files of plain values, YAML or JSON: whatever is wrong with one is one error."""
+"""Text files: plain values read from YAML or JSON, whole files written; whatever is wrong is one error."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -41,6 +42,26 @@ def read_document(path: str | Path, language: str, expected: str) -> Any:
         raise InputError(where, f"no valid {language} ({reason})", expected) from None
     _check_size(content, 1 + len(text), where, expected)
     return content
+
+
+def write_whole(path: str | Path, text: str) -> None:
+    """Write ``text`` to ``path``: completed under another name first, so never half-written.
+
+    Raises InputError where that cannot be.
+    """
+    path = Path(path)
+    unfinished = Path(f"{path}.part")
+    try:
+        if path.exists() and not path.is_file():  # a device, as /dev/null, must not be replaced
+            path.write_text(text, encoding="utf-8")
+            return
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(path)
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a file that can be written") from None
+    finally:
+        with contextlib.suppress(OSError):  # where nothing can be written, nothing can be removed
+            unfinished.unlink(missing_ok=True)
 
 
 def _check_size(content: Any, limit: int, where: str, expected: str) -> None:

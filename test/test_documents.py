@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
-from mems6dof_ros.documents import read_document
+from mems6dof_ros.documents import read_document, write_whole
 from mems6dof_ros.errors import InputError
 
 BOMB = "\n".join(
@@ -44,3 +46,27 @@ def test_documents_are_read(tmp_path):
     assert read_document(path, "YAML", "") is None
     path.write_text('{"x": [1.5, NaN]}')
     assert read_document(path, "JSON", "")["x"][0] == 1.5
+
+
+def test_a_file_is_written_whole(tmp_path):
+    path = tmp_path / "file.yaml"
+    for text in ("z: 1 µm\n", "z: 2 µm\n"):
+        write_whole(path, text)
+        assert path.read_text(encoding="utf-8") == text
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", [".", "absent/file", "file/below", 300 * "n"])
+def test_where_no_file_can_be_written_is_said(tmp_path, name):
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(InputError, match="expected a file that can be written"):
+        write_whole(tmp_path / name, "text")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_device_is_written_to_not_replaced(tmp_path):
+    device = tmp_path / "null"
+    device.symlink_to(os.devnull)
+    write_whole(device, "text")
+    assert device.is_char_device()

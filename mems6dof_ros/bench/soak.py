@@ -13,10 +13,10 @@ import numpy as np
 from mems6dof_ros.bench.material import Material
 from mems6dof_ros.bench.nodes import START, frame_source, resident_memory
 from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.figures import Figure, at_least, at_most, exactly, information
 from mems6dof_ros.pose.cycle_pose import Status
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
-from mems6dof_ros.recording.validation.rows import Figure, at_least, at_most, exactly, information
 
 #: Seconds from one look at the memory to the next.
 PERIOD = 2.0

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from mems6dof_ros.analysis.field_calibration import calibrate_field
 from mems6dof_ros.calibration.file import Calibration
+from mems6dof_ros.figures import Figure, at_most, between, information
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.pose.bodies import Bodies
 from mems6dof_ros.pose.estimator import PoseEstimator
@@ -84,7 +85,7 @@ def learn_field(calibration: Calibration, settings: SimulationSettings, cycles: 
 
 def field_figures(
     seeds: Sequence[int], calibrated: Callable[[int], Calibration], optics: str = "paper"
-) -> list[dict[str, Any]]:
+) -> list[Figure]:
     """Rows for the table of the calibration; ``calibrated(seed)``: the ``optics`` number seed, from beads."""
     before, after = [], []
     for seed in seeds:
@@ -100,17 +101,13 @@ def field_figures(
     what = "x and y of a particle, 6e4 electrons, after field self-calibration"
     rms, claimed = _rms(error), 1 / _rms(error / np.sqrt(total))
     return [
-        _row("x and y of a particle, 6e4 electrons, beads alone, nm rms per axis", _rms(raw) * 1e9),
-        _row(f"{what}, nm rms per axis", rms * 1e9, "<= 2.4", rms <= 2.4e-9),
-        *(_row(f"{what}: {axis} alone, nm", _rms(error[:, k]) * 1e9) for k, axis in enumerate("xy")),
-        _row(f"{what}: noise claimed, nm", float(np.sqrt(noise.mean())) * 1e9),
-        _row(f"claimed over actual {what}", claimed, "0.9 to 1.15", 0.9 <= claimed <= 1.15),
+        information("x and y of a particle, 6e4 electrons, beads alone, nm rms per axis", _rms(raw) * 1e9),
+        at_most(f"{what}, nm rms per axis", rms * 1e9, 2.4),
+        *(information(f"{what}: {axis} alone, nm", _rms(error[:, k]) * 1e9) for k, axis in enumerate("xy")),
+        information(f"{what}: noise claimed, nm", float(np.sqrt(noise.mean())) * 1e9),
+        between(f"claimed over actual {what}", claimed, 0.9, 1.15),
     ]
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _row(quantity: str, measured: float, required: str = "", passed: bool | None = None) -> dict[str, Any]:
-    return {"quantity": quantity, "measured": measured, "required": required, "passed": passed}

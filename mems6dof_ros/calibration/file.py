@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,7 +30,7 @@ from mems6dof_ros.calibration.moments import residual_moments
 from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
 from mems6dof_ros.calibration.psf_estimator import PsfEstimator
 from mems6dof_ros.calibration.psf_model import PsfModel
-from mems6dof_ros.documents import read_document
+from mems6dof_ros.documents import read_document, write_whole
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import WEIGHTINGS
@@ -187,7 +186,7 @@ def _outside(value: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
 
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
-    """Write ``calibration`` to ``path``: completed under another name first, so never half-written."""
+    """Write ``calibration`` to ``path``, whole or not at all; InputError where it cannot be written."""
     document = {
         "format": FORMAT,
         "version": 1 if calibration.correction is None else 2,
@@ -199,15 +198,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     if calibration.correction is not None:
         document["field_correction"]["provenance"] = dict(calibration.correction.provenance)
     text = _HEADER + yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110)
-    path = Path(path)
-    unfinished = path.with_name(path.name + ".part")
-    try:
-        unfinished.write_text(text, encoding="utf-8")
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a file that can be written") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_whole(path, text)
 
 
 def load_calibration(path: str | Path, method: str | None = None) -> Calibration:

@@ -19,6 +19,7 @@ from mems6dof_ros.calibration.optical_model import FEATURES
 from mems6dof_ros.calibration.psf_fit import WAVEFRONT
 from mems6dof_ros.calibration.psf_pupil import PUPIL_TERMS
 from mems6dof_ros.calibration.rho_amp import inverse_curves, rho_amp_of_scan
+from mems6dof_ros.documents import write_whole
 
 #: The paper's axial range, +/- m.
 _PAPER_RANGE = 4e-6
@@ -35,7 +36,7 @@ _LABELS = {
 
 
 def write_report(result: CalibrationResult, path: str | Path) -> None:
-    """Write the page to ``path``."""
+    """Write the page to ``path``, whole or not at all; InputError where it cannot be written."""
     pictures = [
         ("A bead through focus, with the major axis of its fit (Figure 2a)", through_focus(result)),
         ("ρ_amp against z, every bead, and the polynomial (Figure 2b)", amplitude_curves(result)),
@@ -57,7 +58,7 @@ def write_report(result: CalibrationResult, path: str | Path) -> None:
         warnings=result.warnings,
         beads=len(result.beads),
     )
-    Path(path).write_text(text, encoding="utf-8")
+    write_whole(path, text)
 
 
 def through_focus(result: CalibrationResult) -> Picture | None:

@@ -33,6 +33,7 @@ from mems6dof_ros.calibration.real_stacks import (
     plain_orders,
 )
 from mems6dof_ros.errors import InputError
+from mems6dof_ros.figures import Figure, at_least, at_most, between, information
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, fit_gaussians
 from mems6dof_ros.localization.localizations import GaussianFits
@@ -42,8 +43,6 @@ from mems6dof_ros.simulation.optics import Objective, Optics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
 
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 Progress = Callable[[int, int], None]
 
 #: The stacks reach beyond the range that the calibration declares valid.
@@ -199,8 +198,8 @@ def axial_bound(particles: Sequence[Particles], seed: int, background: float, re
         derivatives += [middle / p.electrons[:, None, None], np.ones_like(middle)]
         jacobian = np.stack([d[:, centre, centre].reshape(len(middle), -1) for d in derivatives], axis=1)
         variance = middle[:, centre, centre].reshape(len(middle), 1, -1) + background + read_noise**2
-        information = (jacobian / variance) @ jacobian.transpose(0, 2, 1)
-        bounds.append(np.sqrt(np.linalg.inv(information)[:, 2, 2]))
+        fisher = (jacobian / variance) @ jacobian.transpose(0, 2, 1)
+        bounds.append(np.sqrt(np.linalg.inv(fisher)[:, 2, 2]))
     return np.concatenate(bounds)
 
 
@@ -256,11 +255,11 @@ def accuracy_figures(seeds: Sequence[int]) -> list[Figure]:
             found = pooled([errors(chosen[seed], sets[seed]) for seed in seeds])
             spent = (time.process_time() - start) / found.seen
             name = f"{method}, {electrons:.0e} electrons"
-            table.append(_at_most(f"z rms, {name}, nm", found.rms(2) * 1e9, limits.get((method, electrons))))
-            table.append(_between(f"claimed over actual z, {name}", found.claimed_over_actual(2), 0.9, 1.15))
+            table.append(at_most(f"z rms, {name}, nm", found.rms(2) * 1e9, limits.get((method, electrons))))
+            table.append(between(f"claimed over actual z, {name}", found.claimed_over_actual(2), 0.9, 1.15))
             used = len(found.error) / found.seen
-            table.append(_figure(f"particles without a flag, {name}", used, "", None))
-            table.append(_figure(f"processor time per particle, {name}, ms", spent * 1e3, "", None))
+            table.append(information(f"particles without a flag, {name}", used))
+            table.append(information(f"processor time per particle, {name}, ms", spent * 1e3))
     return table
 
 
@@ -277,12 +276,12 @@ def bound_figures(seeds: Sequence[int]) -> list[Figure]:
             parts.append(errors(calibration.with_method(method), particles))
         bound.append(axial_bound(particles, seed, 10.0, 1.6))
     rms = float(np.sqrt(np.mean(np.concatenate(bound) ** 2)))
-    table = [_figure("Cramer-Rao bound of z, 1e5 electrons, nm", rms * 1e9, "", None)]
+    table = [information("Cramer-Rao bound of z, 1e5 electrons, nm", rms * 1e9)]
     for method, limit in limits.items():
         measured = pooled(found[method])
         table += [
-            _at_most(f"z rms over Cramer-Rao bound, {method}, 1e5 electrons", measured.rms(2) / rms, limit),
-            _between(
+            at_most(f"z rms over Cramer-Rao bound, {method}, 1e5 electrons", measured.rms(2) / rms, limit),
+            between(
                 f"claimed over actual z, {method}, smooth optics", measured.claimed_over_actual(2), 0.9, 1.15
             ),
         ]
@@ -300,9 +299,9 @@ def brightness_figures(seeds: Sequence[int]) -> list[Figure]:
             crossed, same = (c.with_method(method) for c in (other, kind))
             ratio = errors(crossed, particles).rms(2) / errors(same, particles).rms(2)
             name = f"{method}, calibrated at 3e5, measured at {electrons:.0e}"
-            table.append(_at_most(f"z rms over calibrated in kind, {name}", ratio, 1.1))
+            table.append(at_most(f"z rms over calibrated in kind, {name}", ratio, 1.1))
             bias = _bias_difference(crossed, same, particles)
-            table.append(_at_most(f"bias of z against calibrated in kind, {name}, nm", bias * 1e9, 5))
+            table.append(at_most(f"bias of z against calibrated in kind, {name}, nm", bias * 1e9, 5))
     return table
 
 
@@ -330,9 +329,9 @@ def sign_change_figures(seeds: Sequence[int]) -> list[Figure]:
     for method in METHODS:
         found = errors(calibration.with_method(method), particles)
         worst = float(np.max(np.abs(found.error[:, 2]) / found.sd[:, 2]))
-        table.append(_at_most(f"worst unflagged z, sign change, {method}, claimed sd", worst, 5))
+        table.append(at_most(f"worst unflagged z, sign change, {method}, claimed sd", worst, 5))
         used = len(found.error) / found.seen
-        table.append(_figure(f"particles without a flag, sign change, {method}", used, "", None))
+        table.append(information(f"particles without a flag, sign change, {method}", used))
     return table
 
 
@@ -347,13 +346,13 @@ def range_figures(seeds: Sequence[int]) -> list[Figure]:
         chosen = calibration.with_method(method)
         found = errors(chosen, within)
         worst = float(np.max(np.abs(found.error[:, 2]) / found.sd[:, 2]))
-        table.append(_at_most(f"worst unflagged z within 4 um, {method}, claimed sd", worst, 5))
+        table.append(at_most(f"worst unflagged z within 4 um, {method}, claimed sd", worst, 5))
         used = len(found.error) / found.seen
-        table.append(_figure(f"particles without a flag within 4 um, {method}", used, "", None))
+        table.append(information(f"particles without a flag within 4 um, {method}", used))
         far = [chosen.locate(p.fits, p.image).flags | p.fits.flags for p in beyond]
         outside = [np.abs(p.position[:, 2]) > VALID_RANGE + 0.6e-6 for p in beyond]
         missed = sum(int(np.count_nonzero((f == 0) & o)) for f, o in zip(far, outside, strict=True))
-        table.append(_at_most(f"unflagged beyond the range, {method}, particles", missed, 0))
+        table.append(at_most(f"unflagged beyond the range, {method}, particles", missed, 0))
     return table
 
 
@@ -394,11 +393,11 @@ def bad_stack_figures(seeds: Sequence[int]) -> list[Figure]:
     for name, (stack, reference, word) in cases.items():
         said = outcome(stack, reference)
         table.append(
-            _at_least(f"{name}: {said or 'no complaint'}", float((word in said) if word else not said))
+            at_least(f"{name}: {said or 'no complaint'}", float((word in said) if word else not said), 1)
         )
     camera = replace(camera, saturation_adu=ceiling)
     said = outcome(saturated)
-    table.append(_at_least(f"saturation: {said or 'no complaint'}", float("saturated" in said)))
+    table.append(at_least(f"saturation: {said or 'no complaint'}", float("saturated" in said), 1))
     return table
 
 
@@ -413,34 +412,16 @@ def real_figures(folder: Path) -> list[Figure]:
         name = f"{method}, real astigmatic stack"
         apart, wanted = against_stage.apart, method == "psf"
         table += [
-            _figure(f"z rms against the stage as stated, {name}, nm", against_stage.rms * 1e9, "", None),
-            _figure(f"median |z error| against it, {name}, nm", against_stage.median * 1e9, "", None),
-            _at_most(f"z rms, one bead left out, {name}, nm", apart.rms * 1e9, 30 if wanted else None),
-            _at_most(f"median |z error|, {name}, nm", apart.median * 1e9, 18 if wanted else None),
-            _between(f"claimed over actual, {name}", apart.claimed_over_actual, 0.9, 1.15),
-            _figure(f"flagged, {name}", against_stage.flagged, "", None),
+            information(f"z rms against the stage as stated, {name}, nm", against_stage.rms * 1e9),
+            information(f"median |z error| against it, {name}, nm", against_stage.median * 1e9),
+            at_most(f"z rms, one bead left out, {name}, nm", apart.rms * 1e9, 30 if wanted else None),
+            at_most(f"median |z error|, {name}, nm", apart.median * 1e9, 18 if wanted else None),
+            between(f"claimed over actual, {name}", apart.claimed_over_actual, 0.9, 1.15),
+            information(f"flagged, {name}", against_stage.flagged),
         ]
     return [
         *table,
-        _figure("stage steps, real intrinsic bead, one plane left out, rms nm", steps.rms * 1e9, "", None),
-        _figure("flagged, real intrinsic bead", steps.flagged, "", None),
-        _between("claimed over actual, real intrinsic bead", steps.claimed_over_actual, 0.9, 1.15),
+        information("stage steps, real intrinsic bead, one plane left out, rms nm", steps.rms * 1e9),
+        information("flagged, real intrinsic bead", steps.flagged),
+        between("claimed over actual, real intrinsic bead", steps.claimed_over_actual, 0.9, 1.15),
     ]
-
-
-def _figure(quantity: str, measured: float, required: str, passed: bool | None) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
-
-
-def _at_most(quantity: str, measured: float, limit: float | None) -> Figure:
-    if limit is None:
-        return _figure(quantity, measured, "", None)
-    return _figure(quantity, measured, f"<= {limit:g}", bool(measured <= limit))
-
-
-def _at_least(quantity: str, measured: float, limit: float = 1) -> Figure:
-    return _figure(quantity, measured, f">= {limit:g}", bool(measured >= limit))
-
-
-def _between(quantity: str, measured: float, low: float, high: float) -> Figure:
-    return _figure(quantity, measured, f"{low:g} to {high:g}", bool(low <= measured <= high))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mems6dof_ros import __version__
+from mems6dof_ros.figures import Figure
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -17,9 +18,8 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
 
 
-def print_table(figures: Sequence[Mapping[str, Any]]) -> None:
-    """One line a figure: ``quantity``, ``measured`` (NaN: a remark), ``required`` and whether it ``passed``
-    (None: for information)."""
+def print_table(figures: Sequence[Figure]) -> None:
+    """One line a figure."""
     measurements = [row for row in figures if not math.isnan(row["measured"])]
     width = max((len(row["quantity"]) for row in measurements), default=0)
     wanted = max((len(row["required"]) for row in figures), default=0)
@@ -29,7 +29,7 @@ def print_table(figures: Sequence[Mapping[str, Any]]) -> None:
         print(f"{row['quantity']:<{width}}  {measured:>10}  {row['required']:<{wanted}}  {verdict}".rstrip())
 
 
-def conclude(figures: Sequence[Mapping[str, Any]], parameters: Mapping[str, Any], path: Path | None) -> int:
+def conclude(figures: Sequence[Figure], parameters: Mapping[str, Any], path: Path | None) -> int:
     """Count the verdicts, write the figures to ``path`` where there is one; returns the exit status: 1 where
     a figure missed its requirement, or nothing was measured."""
     passed, failed = (sum(row["passed"] is verdict for row in figures) for verdict in (True, False))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mems6dof_ros.cli.figures import add_json_option, conclude
+from mems6dof_ros.figures import Figure, at_most, information
 
 if TYPE_CHECKING:
     from mems6dof_ros.simulation.settings import SimulationSettings
@@ -60,7 +61,7 @@ def measure(
     seed: int = 1,
     calibration: Path | None = None,
     ros: bool = True,
-) -> list[dict[str, Any]]:
+) -> list[Figure]:
     """Print the tables and return the rows that have a requirement, and those of the reaction."""
     from mems6dof_ros.simulation.settings import SimulationSettings
 
@@ -72,21 +73,11 @@ def measure(
     return rows
 
 
-def _row(quantity: str, measured: float, limit: float) -> dict[str, Any]:
-    """A figure that must not exceed ``limit``."""
-    return {
-        "quantity": quantity,
-        "measured": measured,
-        "required": f"<= {limit:g}",
-        "passed": bool(measured <= limit),
-    }
-
-
-def _verdict(row: dict[str, Any]) -> str:
+def _verdict(row: Figure) -> str:
     return "pass" if row["passed"] else "FAIL"
 
 
-def _synthetic(drives: int, targets: int) -> list[dict[str, Any]]:
+def _synthetic(drives: int, targets: int) -> list[Figure]:
     """Angle errors of many drives, closed and open loop."""
     import numpy as np
 
@@ -100,7 +91,7 @@ def _synthetic(drives: int, targets: int) -> list[dict[str, Any]]:
             error, blind = (1e3 * np.array([move.error for move in moves]) for moves in (closed, opened))
             arrived = all(move.state is State.ARRIVED for move in closed)
             largest = float(abs(error).max()) if arrived else np.inf
-            row = _row(f"largest error, mrad: {drive.name}", largest, drive.tolerance * 1e3)
+            row = at_most(f"largest error, mrad: {drive.name}", largest, drive.tolerance * 1e3)
             cycles, fewest = (np.mean([getattr(m, name) for m in closed]) for name in ("cycles", "fewest"))
             lines.append(
                 f"{drive.name:32}{largest:9.2f}{drive.tolerance * 1e3:9.2f}  {_verdict(row)}"
@@ -116,7 +107,7 @@ def _synthetic(drives: int, targets: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _faults() -> list[dict[str, Any]]:
+def _faults() -> list[Figure]:
     """Cycles made after each fault."""
     from mems6dof_ros.control.validation import FAULTS, cycles_after
 
@@ -124,14 +115,12 @@ def _faults() -> list[dict[str, Any]]:
     print("\nmotion cycles made after a fault began; synthetic poses")
     for name, fault in FAULTS.items():
         cycles, reason = cycles_after(fault)
-        rows.append(_row(f"cycles after: {name}", cycles, 1))
+        rows.append(at_most(f"cycles after: {name}", cycles, 1))
         print(f"{name:34}{cycles:3d}  {_verdict(rows[-1])}  {reason}")
     return rows
 
 
-def _real(
-    settings: SimulationSettings, targets: int, calibration: Path | None, folder: Path
-) -> list[dict[str, Any]]:
+def _real(settings: SimulationSettings, targets: int, calibration: Path | None, folder: Path) -> list[Figure]:
     """The same through ROS 2, from rendered frames."""
     import numpy as np
 
@@ -163,17 +152,15 @@ def _real(
         if move.reason:
             print(f"NOT reached: {move.target:.4f} rad, {move.reason}")
     largest = np.inf if any(move.reason for move in closed) else max(abs(move.error) for move in closed) * 1e3
-    rows = [_row("largest error, mrad: ROS 2", float(largest), max(drive.resolution, 1e-3) * 1e3)]
+    rows = [at_most("largest error, mrad: ROS 2", float(largest), max(drive.resolution, 1e-3) * 1e3)]
     print(f"\n{table}")
     for name, what in (("reaction", "frame to next command"), ("bare transport", "its bare transport")):
         for label, percent in (("median", 50), ("99 %", 99)):
             measured = float(np.percentile(times[name], percent)) * 1e3
-            rows.append(
-                {"quantity": f"{what}, ms, {label}", "measured": measured, "required": "", "passed": None}
-            )
+            rows.append(information(f"{what}, ms, {label}", measured))
     print("\nmotion cycles exposed after a loss; ROS 2")
     for name, cycles, reason in safe_stops(settings, calibration, folder / "nodes.log"):
-        rows.append(_row(f"cycles after: {name}", cycles, 1))
+        rows.append(at_most(f"cycles after: {name}", cycles, 1))
         print(f"{name:34}{cycles:3d}  {_verdict(rows[-1])}  {reason}")
     return rows
 

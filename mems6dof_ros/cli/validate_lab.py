@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
+from mems6dof_ros.figures import Figure
 
 #: Part to the module that measures it by ``figures(work: Path, seed: int, tell: Callable[[str], None])``: it
-#: works in the directory ``work``, tells what it is doing, and yields rows of quantity, measured, required
-#: (text) and passed (None: for information).
+#: works in the directory ``work``, tells what it is doing, and yields rows of the table.
 PARTS = {
     "messages": "mems6dof_ros.nodes.hostile",
     "outages": "mems6dof_ros.nodes.outages",
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     return conclude(table, {"parts": parts, "seed": args.seed}, args.json)
 
 
-def _figures(part: str, work: Path, args: argparse.Namespace) -> Iterable[Mapping[str, Any]]:
+def _figures(part: str, work: Path, args: argparse.Namespace) -> Iterable[Figure]:
     def tell(text: str) -> None:
         print(f"... {text}", flush=True)
 
@@ -71,4 +71,4 @@ def _figures(part: str, work: Path, args: argparse.Namespace) -> Iterable[Mappin
 
         return soak(args.soak, work, tell)
     figures = importlib.import_module(PARTS[part]).figures
-    return cast("Iterable[Mapping[str, Any]]", figures(work, args.seed, tell))
+    return cast("Iterable[Figure]", figures(work, args.seed, tell))

@@ -10,12 +10,12 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mems6dof_ros.figures import Figure, at_most, between, information
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, fit_gaussians
 from mems6dof_ros.localization.gaussian import Array, cramer_rao, gaussian, pixel_grid
@@ -25,9 +25,6 @@ from mems6dof_ros.simulation.aberrations import FieldAberrations
 from mems6dof_ros.simulation.experiment import motion_frames
 from mems6dof_ros.simulation.optics import Objective, Optics
 from mems6dof_ros.simulation.settings import SimulationSettings
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 OFFSET_ADU = 100.0
 
@@ -108,15 +105,6 @@ def figures(
     return table
 
 
-def _figure(quantity: str, measured: float, low: float = -math.inf, high: float = math.inf) -> Figure:
-    if low > -math.inf and high < math.inf:
-        required = f"{low:g} to {high:g}"
-    else:
-        required = f"at most {high:g}" if high < math.inf else f"at least {low:g}" if low > -math.inf else ""
-    passed = bool(low <= measured <= high) if required else None
-    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
-
-
 def _errors(fits: GaussianFits, truth: Array) -> tuple[Array, Array]:
     """Errors of the good fits and the mean standard deviations that they claim, (n, 7) and (7,)."""
     good = fits.flags == 0
@@ -134,13 +122,13 @@ def matched_fits(count: int, seed: int) -> list[Figure]:
         fits = fit_gaussians(image, start, camera, weighting, 21)
         errors, claimed = _errors(fits, truth)
         name = f"matched fit, {weighting}"
-        table.append(_figure(f"{name}: failures", np.sum(fits.flags != 0), high=0))
+        table.append(at_most(f"{name}: failures", np.sum(fits.flags != 0), 0))
         for k in (0, 1, 3, 4, 5):
             rms = math.sqrt(np.mean(errors[:, k] ** 2))
-            table.append(_figure(f"{name}: rms({FIT_PARAMETERS[k]}) / Cramer-Rao", rms / bound[k], high=1.05))
+            table.append(at_most(f"{name}: rms({FIT_PARAMETERS[k]}) / Cramer-Rao", rms / bound[k], 1.05))
         for k, parameter in enumerate(FIT_PARAMETERS):
             ratio = claimed[k] / errors[:, k].std()
-            table.append(_figure(f"{name}: claimed / actual sd({parameter})", ratio, 0.95, 1.05))
+            table.append(between(f"{name}: claimed / actual sd({parameter})", ratio, 0.95, 1.05))
     return table
 
 
@@ -154,16 +142,16 @@ def _weightings(count: int, seed: int) -> list[Figure]:
     deviation = {weighting: error[:, :2].std() for weighting, error in errors.items()}
     best = deviation["poisson"]
     return [
-        _figure("sd(x, y), light_weighting / poisson", deviation["light_weighting"] / best, 0.97, 1.03),
-        _figure("sd(x, y), uniform / poisson", deviation["uniform"] / best, 1.25, 1.4),
-        _figure("sd(x, y), default weighting / poisson", deviation[DEFAULT_WEIGHTING] / best, high=1.1),
-        _figure(
+        between("sd(x, y), light_weighting / poisson", deviation["light_weighting"] / best, 0.97, 1.03),
+        between("sd(x, y), uniform / poisson", deviation["uniform"] / best, 1.25, 1.4),
+        at_most("sd(x, y), default weighting / poisson", deviation[DEFAULT_WEIGHTING] / best, 1.1),
+        between(
             "bias of B, light_weighting, electrons", errors["light_weighting"][:, 6].mean(), -0.35, -0.15
         ),
-        _figure(
+        between(
             "bias of B, default weighting, electrons", errors[DEFAULT_WEIGHTING][:, 6].mean(), -0.05, 0.05
         ),
-        _figure("bias of B, poisson, electrons", errors["poisson"][:, 6].mean(), -0.05, 0.05),
+        between("bias of B, poisson, electrons", errors["poisson"][:, 6].mean(), -0.05, 0.05),
     ]
 
 
@@ -190,9 +178,9 @@ def _brightness(count: int, seed: int) -> list[Figure]:
         name = f"brightness 3e4 against 3e5, {weighting}"
         nanometres = 1e9 * Objective().pixel_size
         table += [
-            _figure(f"{name}: shift of x, y, nm", nanometres * max(x, y), high=1.5 if limited else math.inf),
-            _figure(f"{name}: shift of ln sigma", max(ln_x, ln_y), high=0.005 if limited else math.inf),
-            _figure(f"{name}: shift of rho", rho, high=0.005 if limited else math.inf),
+            at_most(f"{name}: shift of x, y, nm", nanometres * max(x, y), 1.5 if limited else None),
+            at_most(f"{name}: shift of ln sigma", max(ln_x, ln_y), 0.005 if limited else None),
+            at_most(f"{name}: shift of rho", rho, 0.005 if limited else None),
         ]
     return table
 
@@ -214,7 +202,7 @@ def _honesty(count: int, seed: int) -> list[Figure]:
         ratio = np.sqrt(np.mean(np.divide(claimed, actual), axis=0))
         for k, name in enumerate(("x", "y", "ln sigma_x", "ln sigma_y", "rho")):
             quantity = f"physical images, {electrons:.0e} electrons: claimed / actual sd({name})"
-            table.append(_figure(quantity, ratio[k], 0.93, 1.07))
+            table.append(between(quantity, ratio[k], 0.93, 1.07))
     return table
 
 
@@ -244,8 +232,8 @@ def _detection(seed: int) -> list[Figure]:
         invented += int((tree.query(trusted)[0] > 1e-6).sum())
         expected += int(wanted.sum())
     return [
-        _figure(f"isolated particles missed, of {expected}, at heights of -3 to 3 um", missed, high=0),
-        _figure("trusted localizations without a particle within 1 um", invented, high=0),
+        at_most(f"isolated particles missed, of {expected}, at heights of -3 to 3 um", missed, 0),
+        at_most("trusted localizations without a particle within 1 um", invented, 0),
     ]
 
 
@@ -262,13 +250,15 @@ def _speed(seed: int) -> list[Figure]:
         for weighting in (DEFAULT_WEIGHTING, "light_weighting", "uniform", "poisson"):
             fit = partial(fit_gaussians, image, truth[:, :2], camera, weighting, window_px)
             rate = len(truth) / _seconds(fit)
-            table.append(_figure(f"fits per second, {window_px} px, {weighting}", round(rate, -2)))
+            table.append(information(f"fits per second, {window_px} px, {weighting}", round(rate, -2)))
     settings = SimulationSettings(seed=seed)
     frame = next(iter(motion_frames(settings, 1)))
     localizer = _localizer(settings)
     rate = 1 / _seconds(lambda: localizer.localize(frame), 15)
     table.append(
-        _figure(f"frames per second, 2048 x 2048, {len(localizer.localize(frame))} particles", round(rate))
+        information(
+            f"frames per second, 2048 x 2048, {len(localizer.localize(frame))} particles", round(rate)
+        )
     )
     return table
 

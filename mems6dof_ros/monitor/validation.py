@@ -27,15 +27,13 @@ import aiohttp
 import numpy as np
 
 from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.figures import Figure, at_least, at_most, exactly, information
 from mems6dof_ros.monitor.attacks import ATTACKS, Attack, wrong_token
 from mems6dof_ros.monitor.feed import Feed
 from mems6dof_ros.monitor.history import COLUMNS
 from mems6dof_ros.monitor.server import MonitorServer
 from mems6dof_ros.monitor.synthetic import Machine
 from mems6dof_ros.recording import topics
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 #: Cycles per second of the drive.
 DRIVE = 90.0
@@ -44,29 +42,6 @@ _SERVICES = ("frame_source/stop", "frame_source/start", "pose_estimator/set_refe
 _SCREENS = {"laptop": (1366, 768), "projector": (1920, 1080)}
 _READY = "() => mems6dof.charts[0].data?.y.length > 0"
 _PICTURES = "[...document.querySelectorAll('canvas')].map((canvas) => canvas.toDataURL())"
-
-
-def at_most(quantity: str, measured: float, limit: float) -> Figure:
-    """A figure that must not exceed ``limit``."""
-    passed = bool(measured <= limit)
-    return {"quantity": quantity, "measured": float(measured), "required": f"<= {limit:g}", "passed": passed}
-
-
-def at_least(quantity: str, measured: float, limit: float) -> Figure:
-    """A figure that must reach ``limit``."""
-    passed = bool(measured >= limit)
-    return {"quantity": quantity, "measured": float(measured), "required": f">= {limit:g}", "passed": passed}
-
-
-def exactly(quantity: str, measured: float, wanted: float) -> Figure:
-    """A figure that must be ``wanted``."""
-    passed = bool(measured == wanted)
-    return {"quantity": quantity, "measured": float(measured), "required": f"{wanted:g}", "passed": passed}
-
-
-def remark(quantity: str, measured: float) -> Figure:
-    """A figure for information."""
-    return {"quantity": quantity, "measured": float(measured), "required": "", "passed": None}
 
 
 # Browser, nodes ------------------------------------------------------------------------------------
@@ -358,8 +333,8 @@ def _in_turns(
                 rates, latencies = np.mean(without[-2:], axis=0)
                 ratios[where].append((rate_with / rates, latency_with / latencies))
     base_rate, base_latency = np.median(without, axis=0)
-    yield remark(f"{name}: poses per second, no page", base_rate)
-    yield remark(f"{name}: median latency, ms, no page", base_latency * 1e3)
+    yield information(f"{name}: poses per second, no page", base_rate)
+    yield information(f"{name}: median latency, ms, no page", base_latency * 1e3)
     for where, found in ratios.items():
         rates, latencies = np.median(found, axis=0)
         yield at_least(f"{name}: rate with a page {where}, of that without", rates, 0.95)
@@ -455,8 +430,8 @@ def endurance(
     yield at_most(f"{minutes}: growth of the node's memory, MB, of {early[2]:.0f}", node, 5.0)
     yield at_most(f"{minutes}: growth of the elements of the page, of {early[4]:.0f}", elements, 250)
     yield at_most(f"{minutes}: growth of the lag, ms, of {early[3] * 1e3:.0f}", lag * 1e3, 20.0)
-    yield remark("processor time of the monitor node per cycle, ms", busy[0] / passed / DRIVE * 1e3)
-    yield remark("processor time of the page per second, s", busy[1] / passed)
+    yield information("processor time of the monitor node per cycle, ms", busy[0] / passed / DRIVE * 1e3)
+    yield information("processor time of the page per second, s", busy[1] / passed)
     for complaint in console.complaints:
         tell(f"console: {complaint}")
     yield exactly(f"{minutes}: errors and warnings on the console", len(console.complaints), 0)

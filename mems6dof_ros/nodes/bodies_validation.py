@@ -8,6 +8,7 @@ from typing import Any
 from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.analysis.relative import relative_motion
 from mems6dof_ros.analysis.truth import compare
+from mems6dof_ros.figures import Figure, between, exactly, information
 from mems6dof_ros.nodes.system import chain, run_system, simulated
 from mems6dof_ros.simulation.settings import SimulationSettings
 
@@ -27,7 +28,7 @@ bodies:
 
 def bodies_figures(
     settings: SimulationSettings, calibration: Path, out: Path, cycles: int = 80
-) -> list[dict[str, Any]]:
+) -> list[Figure]:
     """Rows for ``validate stream``: the optics of ``settings``, with ``calibration``; works in ``out``."""
     file = out / "bodies.yaml"
     file.write_text(BODIES, encoding="utf-8")
@@ -49,21 +50,13 @@ def bodies_figures(
         valid = [pose for pose in poses if pose.valid]
         comparison = compare(valid, [truth for truth in recording.truth_of(valid) if truth is not None])
         rows += [
-            _row(f"two bodies, {body}: valid poses", len(valid), f"{cycles}", len(valid) == cycles),
-            _between(f"two bodies, {body}: NEES/6", comparison.nees_per_dof),
+            exactly(f"two bodies, {body}: valid poses", len(valid), cycles),
+            between(f"two bodies, {body}: NEES/6", comparison.nees_per_dof, 0.8, 1.3),
         ]
     relative = relative_motion(recording, "ring_gear", "load_gear")
     if relative.error is not None:
         error = (relative.error - relative.error.mean(axis=0)) / relative.sd
         chi = float((error**2).sum() / (len(error) - 1) / error.shape[1])
         # For information: what the field does to both alike is not in it, a few tens of per cent either way.
-        rows.append(_row("two bodies: relative motion, squared error over claimed", chi, "", None))
+        rows.append(information("two bodies: relative motion, squared error over claimed", chi))
     return rows
-
-
-def _between(quantity: str, measured: float) -> dict[str, Any]:
-    return _row(quantity, measured, "0.8 to 1.3", bool(0.8 <= measured <= 1.3))
-
-
-def _row(quantity: str, measured: float, required: str, passed: bool | None) -> dict[str, Any]:
-    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}

@@ -8,12 +8,12 @@ import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import Image
 
 from mems6dof_msgs.msg import FrameInfo, GroundTruth, Pose6DOF
+from mems6dof_ros.figures import Figure, exactly, figure, information
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.bystander import Bystander, running
 from mems6dof_ros.nodes.hostile import calibrate_quickly
@@ -22,9 +22,6 @@ from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.experiment import motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.cameras.emulation import GigeEmulator, WireCounter, basler_emulator
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 #: Images of a gear that turns on and back, over and over: motion cycles from one turning point to the other.
 _SWING = 8
@@ -82,16 +79,16 @@ def gige(seconds: float, size: int, rate: float) -> Iterator[Figure]:
             bystander.until(lambda: len(watched.infos) > frames + 40, "frames after the restart")
             outage = watched.infos[frames]
             counted = bystander.counts_settled("frame_source")["frame_source"]
-    yield _information("frames produced, as counted on the wire", produced)
-    yield _information("frames per second", (frames - 1) / ((ended - began) * 1e-9))
-    yield _information("reported lost", reported)
-    yield _exact("produced - published - reported lost", produced - frames - reported, 0)
-    yield _information("images that this listener was too slow for", len(watched.infos) - watched.images)
-    yield _exact("stamps that do not ascend", sum(b <= a for a, b in pairwise(watched.stamps)), 0)
-    yield _figure("unplugged: from its restart to the next frame, s", resumed, "< 10", resumed < 10)
+    yield information("frames produced, as counted on the wire", produced)
+    yield information("frames per second", (frames - 1) / ((ended - began) * 1e-9))
+    yield information("reported lost", reported)
+    yield exactly("produced - published - reported lost", produced - frames - reported, 0)
+    yield information("images that this listener was too slow for", len(watched.infos) - watched.images)
+    yield exactly("stamps that do not ascend", sum(b <= a for a, b in pairwise(watched.stamps)), 0)
+    yield figure("unplugged: from its restart to the next frame, s", resumed, "< 10", resumed < 10)
     dropped = outage.frames_dropped
-    yield _figure("unplugged: frames reported lost with that frame", dropped, "> 0", dropped > 0)
-    yield _exact("unplugged: reconnects in the diagnostics", counted["camera reconnects"], 1)
+    yield figure("unplugged: frames reported lost with that frame", dropped, "> 0", dropped > 0)
+    yield exactly("unplugged: reconnects in the diagnostics", counted["camera reconnects"], 1)
 
 
 def poses(seconds: float, size: int, rate: float) -> Iterator[Figure]:
@@ -137,16 +134,16 @@ def poses(seconds: float, size: int, rate: float) -> Iterator[Figure]:
     errors = _errors(valid, [frame.truth[0] for frame in seen])
     unmeasured = counted["localizer"].get("lost", 0)
     duration = (watched.stamps[-1] - watched.stamps[0]) * 1e-9
-    yield _information("frames produced, by the camera's counter", produced)
-    yield _information("frames per second", (len(infos) - 1) / duration)
-    yield _exact("produced - published - reported lost", produced - len(infos) - lost, 0)
-    yield _exact("stamps that do not ascend", sum(b <= a for a, b in pairwise(watched.stamps)), 0)
-    yield _information("frames that the localizer could not keep up with, counted", unmeasured)
+    yield information("frames produced, by the camera's counter", produced)
+    yield information("frames per second", (len(infos) - 1) / duration)
+    yield exactly("produced - published - reported lost", produced - len(infos) - lost, 0)
+    yield exactly("stamps that do not ascend", sum(b <= a for a, b in pairwise(watched.stamps)), 0)
+    yield information("frames that the localizer could not keep up with, counted", unmeasured)
     unaccounted = produced - len(measured) - unmeasured
-    yield _information("frames without a pose that are not counted yet", unaccounted)
-    yield _information("poses per second", len(measured) / duration)
-    yield _exact("poses that are not valid", len(measured) - len(valid), 0)
-    yield _figure("psi against truth, rms, rad", errors, "< 1e-4", errors < 1e-4)
+    yield information("frames without a pose that are not counted yet", unaccounted)
+    yield information("poses per second", len(measured) / duration)
+    yield exactly("poses that are not valid", len(measured) - len(valid), 0)
+    yield figure("psi against truth, rms, rad", errors, "< 1e-4", errors < 1e-4)
 
 
 def _errors(measured: list[Pose6DOF], truths: list[GroundTruth]) -> float:
@@ -160,15 +157,3 @@ def _errors(measured: list[Pose6DOF], truths: list[GroundTruth]) -> float:
         off = np.angle(np.exp(1j * (psi - expected)))
         best = min(best, float(np.std(off)))
     return best
-
-
-def _figure(quantity: str, measured: float, required: str, passed: bool | None) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
-
-
-def _exact(quantity: str, measured: float, wanted: float) -> Figure:
-    return _figure(quantity, measured, f"{wanted:g}", measured == wanted)
-
-
-def _information(quantity: str, measured: float) -> Figure:
-    return _figure(quantity, measured, "", None)

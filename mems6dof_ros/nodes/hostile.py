@@ -14,7 +14,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from mcap.reader import make_reader
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -26,6 +25,7 @@ from mems6dof_msgs.msg import ControllerState, FrameInfo, Localizations, Pose6DO
 from mems6dof_ros.calibration.calibrate import calibrate
 from mems6dof_ros.calibration.file import load_calibration, save_calibration
 from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, measure_stack
+from mems6dof_ros.figures import Figure, at_most, exactly, information
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
 from mems6dof_ros.localization.localizer import Localizer
@@ -39,9 +39,6 @@ from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.experiment import focus_stack, motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 #: A gear that fits into a small field, so that the nodes are quick.
 SMALL = {"width_px": 512, "height_px": 512, "gear_diameter": 60e-6, "hub_diameter": 8e-6, "particles": 30}
@@ -145,28 +142,28 @@ def broken_frames(
     measured = {stamp: poses[stamp][0] for stamp in expected if poses[stamp] and poses[stamp][0].valid}
     apart = [abs(pose.displacement - expected[stamp].displacement).max() for stamp, pose in measured.items()]
     refused = {name: counts.get("refused", 0) for name, counts in counted.items()}
-    yield _information("good frames", len(good))
-    yield _exact("nodes that ended", len(ended), 0)
-    yield _exact("valid poses of good frames", len(measured), len(expected))
-    yield _figure("largest departure from the poses without disturbance, m or rad", max(apart), SAME)
-    yield _exact(
+    yield information("good frames", len(good))
+    yield exactly("nodes that ended", len(ended), 0)
+    yield exactly("valid poses of good frames", len(measured), len(expected))
+    yield at_most("largest departure from the poses without disturbance, m or rad", max(apart), SAME)
+    yield exactly(
         "valid poses of anything else", sum(p[0].valid for s, p in poses.items() if s not in expected), 0
     )
-    yield _exact("poses beyond one a frame", sum(len(p) - 1 for p in poses.values()), 0)
+    yield exactly("poses beyond one a frame", sum(len(p) - 1 for p in poses.values()), 0)
     total = broken_images + repeated
-    yield _exact(
+    yield exactly(
         f"localizer: images refused of {total} broken, repeated or late", refused["localizer"], total
     )
     total = broken_localizations + repeated
-    yield _exact(
+    yield exactly(
         f"pose_estimator: localizations refused of {total} broken, repeated or late",
         refused["pose_estimator"],
         total,
     )
-    yield _exact(
+    yield exactly(
         "localizer: frames lost, which are the numbers of nonsense", counted["localizer"]["lost"], len(good)
     )
-    yield _exact("pose_estimator: localizations lost", counted["pose_estimator"].get("lost", 0), 0)
+    yield exactly("pose_estimator: localizations lost", counted["pose_estimator"].get("lost", 0), 0)
 
 
 def fuzzed_topics(
@@ -228,29 +225,15 @@ def fuzzed_topics(
         after = tries(0.3)
         counted = bystander.counts_settled(*names)
         ended = system.poll()
-    yield _information("topics that nodes subscribe to", len(attacked))
-    yield _information("fuzzed messages and garbage sent", sent)
-    yield _exact("nodes that ended", len(ended), 0)
-    yield _exact("nodes that still report", len(counted), len(names))
-    yield _information("messages refused", sum(counts.get("refused", 0) for counts in counted.values()))
-    yield _exact("targets sent until one was reached, before", calm, 1)
-    yield _figure("targets sent until one was reached, after", after, _MOST_TRIES - 1)
+    yield information("topics that nodes subscribe to", len(attacked))
+    yield information("fuzzed messages and garbage sent", sent)
+    yield exactly("nodes that ended", len(ended), 0)
+    yield exactly("nodes that still report", len(counted), len(names))
+    yield information("messages refused", sum(counts.get("refused", 0) for counts in counted.values()))
+    yield exactly("targets sent until one was reached, before", calm, 1)
+    yield at_most("targets sent until one was reached, after", after, _MOST_TRIES - 1)
     with (work / "bag" / "bag_0.mcap").open("rb") as stream:
         recorded = sum(1 for _ in make_reader(stream).iter_messages())
-    yield _figure(
+    yield at_most(
         "recorded messages that a reader does not find", counted["recorder"]["messages"] - recorded, 0
     )
-
-
-def _figure(quantity: str, measured: float, most: float) -> Figure:
-    passed = bool(measured <= most)
-    return {"quantity": quantity, "measured": float(measured), "required": f"<= {most:g}", "passed": passed}
-
-
-def _exact(quantity: str, measured: float, wanted: float) -> Figure:
-    passed = bool(measured == wanted)
-    return {"quantity": quantity, "measured": float(measured), "required": f"{wanted:g}", "passed": passed}
-
-
-def _information(quantity: str, measured: float) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": "", "passed": None}

@@ -21,14 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from mems6dof_ros.figures import Figure, between, exactly, information, remark
 from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 _TIMEOUT = 300.0  # s
 #: Whatever limits discovery here must not limit it there.
@@ -38,7 +36,7 @@ _UNLIMITED = ("env", "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET")
 def figures(work: Path, seed: int, tell: Callable[[str], None]) -> Iterator[Figure]:
     """All figures, or a remark on what is missing here."""
     if reason := why_not():
-        yield {"quantity": "across machines", "measured": float("nan"), "required": reason, "passed": None}
+        yield remark(f"across machines: {reason}")
         return
     tell("full frames from one network namespace to another")
     yield from across_machines(work, size=2048, cycles=60, rate=5.0, seed=seed)
@@ -120,20 +118,15 @@ def across_machines(
     with BagReader(bag) as reader:
         found = [recorded.message for recorded in reader.messages([f"/{topics.LOCALIZATIONS}"])]
         poses = reader.counts[f"/{topics.POSE_6DOF}"]
-    yield _exact("across machines: nodes that failed", sum(map(bool, codes.values())), 0)
-    yield _exact(f"across machines: frames of {size} px at {rate:g}/s localized", len(found), cycles)
-    yield _exact("across machines: poses", poses, cycles)
+    yield exactly("across machines: nodes that failed", sum(map(bool, codes.values())), 0)
+    yield exactly(f"across machines: frames of {size} px at {rate:g}/s localized", len(found), cycles)
+    yield exactly("across machines: poses", poses, cycles)
     expense = carried / (2 * size**2 * cycles)
-    yield {
-        "quantity": "across machines: bytes on the wire for each of a frame",
-        "measured": expense,
-        "required": "1 to 2",
-        "passed": 1 <= expense <= 2,
-    }
+    yield between("across machines: bytes on the wire for each of a frame", expense, 1, 2)
     transported = np.array([message.latency_frame_transport for message in found]) * 1e3
     for name, percent in (("median", 50), ("99 %", 99)):
         latency = float(np.percentile(transported, percent))
-        yield _information(f"across machines: {name} time of a frame on its way, ms", latency)
+        yield information(f"across machines: {name} time of a frame on its way, ms", latency)
 
 
 def _received_bytes(host: Sequence[str]) -> int:
@@ -141,12 +134,3 @@ def _received_bytes(host: Sequence[str]) -> int:
     command = (*host, "ip", "-json", "-stats", "link")
     links = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     return sum(link["stats64"]["rx"]["bytes"] for link in links if link["ifname"] != "lo")
-
-
-def _exact(quantity: str, measured: float, wanted: float) -> Figure:
-    passed = bool(measured == wanted)
-    return {"quantity": quantity, "measured": float(measured), "required": f"{wanted:g}", "passed": passed}
-
-
-def _information(quantity: str, measured: float) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": "", "passed": None}

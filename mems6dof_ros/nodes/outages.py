@@ -27,6 +27,7 @@ from mems6dof_msgs.msg import ControllerState, FrameInfo, Pose6DOF
 from mems6dof_ros.analysis.simulated import calibrate_simulated
 from mems6dof_ros.calibration.file import save_calibration
 from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.figures import Figure, at_most, exactly, information
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.closed_loop import PATIENT, data_sheet
 from mems6dof_ros.nodes.loop_client import WATCHED, loop_client
@@ -35,9 +36,6 @@ from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.recording.recover import recover
 from mems6dof_ros.simulation.settings import SimulationSettings
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 #: A gear that fits into a small field, so that the nodes are quick.
 SMALL = {"width_px": 512, "height_px": 512, "gear_diameter": 60e-6, "hub_diameter": 8e-6, "particles": 30}
@@ -174,17 +172,17 @@ def _outage(seen: Witness, system: RunningSystem, victim: str) -> Iterator[Figur
     settled = time.monotonic() + 4.0
     seen.until(lambda: time.monotonic() > settled, "end")
     after = [pose for pose in seen.poses[poses:] if not measures or pose.at > begin + 1.0]
-    yield _figure(f"{victim} killed: cycles without a valid pose once poses return", _invalid(after), 1)
+    yield at_most(f"{victim} killed: cycles without a valid pose once poses return", _invalid(after), 1)
     silence = float(np.diff([pose.at for pose in seen.poses[poses - 1 :]]).max())
-    yield _information(f"{victim} killed: longest time without a pose, s", silence)
+    yield information(f"{victim} killed: longest time without a pose, s", silence)
     if victim == "frame_source":
         return  # its frames begin anew
     counters = [pose.counter for pose in seen.poses[poses - 1 :]]
     heard = {frame.counter for frame in seen.frames if counters[0] < frame.counter < counters[-1]}
     missing, told = len(heard - set(counters)), sum(np.diff(counters) - 1)
-    yield _exact(f"{victim} killed: missing poses that frame_counter does not tell", missing - told, 0)
+    yield exactly(f"{victim} killed: missing poses that frame_counter does not tell", missing - told, 0)
     if not measures:
-        yield _exact(f"{victim} killed: frames without a pose", missing, 0)
+        yield exactly(f"{victim} killed: frames without a pose", missing, 0)
 
 
 def _invalid(poses: Sequence[_Seen]) -> int:
@@ -200,10 +198,10 @@ def _hang(seen: Witness, system: RunningSystem) -> Iterator[Figure]:
     newest = seen.frames[-1].counter
     seen.until(lambda: seen.poses[-1].counter >= newest, "pose after the hang")
     caught_up = time.monotonic() - resumes
-    yield _figure(f"pose_estimator hung for {HANG:g} s: until the newest frame has its pose, s", caught_up, 2)
+    yield at_most(f"pose_estimator hung for {HANG:g} s: until the newest frame has its pose, s", caught_up, 2)
     gaps = [pose.counter for pose in seen.poses if pose.at > resumes]
-    yield _exact("pose_estimator hung: nodes that ended", len(system.poll()), 0)
-    yield _figure("pose_estimator hung: poses out of order afterwards", sum(np.diff(gaps) <= 0), 0)
+    yield exactly("pose_estimator hung: nodes that ended", len(system.poll()), 0)
+    yield at_most("pose_estimator hung: poses out of order afterwards", sum(np.diff(gaps) <= 0), 0)
 
 
 def _records(bag: Path, poses: Sequence[_Seen], killed_at: float) -> Iterator[Figure]:
@@ -212,12 +210,12 @@ def _records(bag: Path, poses: Sequence[_Seen], killed_at: float) -> Iterator[Fi
     before = [pose.counter for pose in poses if pose.at < killed_at - 1 / RATE]
     recorded = _counters(bag)
     missing = len(set(before) - set(recorded))
-    yield _exact("recorder killed: poses older than a cycle that are not in its bag", missing, 0)
+    yield exactly("recorder killed: poses older than a cycle that are not in its bag", missing, 0)
     recorded = _counters(bag.with_name(f"{bag.name}_1"))
     after = [pose.counter for pose in poses if pose.at > killed_at]
     begin = after.index(recorded[0])
     lost = len(after) - begin - len(recorded)
-    yield _exact("recorder killed: poses that the bag beside it lacks from its first on", lost, 0)
+    yield exactly("recorder killed: poses that the bag beside it lacks from its first on", lost, 0)
 
 
 def _counters(bag: Path) -> list[int]:
@@ -247,23 +245,9 @@ def controller_outage(settings: SimulationSettings, calibration: Path, work: Pat
         before = client.cycles
         rest = time.monotonic() + 1.0
         client.until(lambda: time.monotonic() > rest, "rest")
-        yield _exact("controller killed: motion cycles without one", client.cycles - before, 0)
+        yield exactly("controller killed: motion cycles without one", client.cycles - before, 0)
         target = client.received[topics.POSE_6DOF][-1].psi + 0.5
         state = client.go(target)
         arrived = state.state == ControllerState.STATE_ARRIVED
         (work / "controller.log").write_text("\n".join(lines), encoding="utf-8")
-        yield _exact("controller killed: next target reached by the new one", arrived, 1)
-
-
-def _figure(quantity: str, measured: float, most: float) -> Figure:
-    passed = bool(measured <= most)
-    return {"quantity": quantity, "measured": float(measured), "required": f"<= {most:g}", "passed": passed}
-
-
-def _exact(quantity: str, measured: float, wanted: float) -> Figure:
-    passed = bool(measured == wanted)
-    return {"quantity": quantity, "measured": float(measured), "required": f"{wanted:g}", "passed": passed}
-
-
-def _information(quantity: str, measured: float) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": "", "passed": None}
+        yield exactly("controller killed: next target reached by the new one", arrived, 1)

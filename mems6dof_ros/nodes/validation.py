@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
@@ -15,6 +14,7 @@ from mems6dof_ros.analysis.recording import Recording, load_recording
 from mems6dof_ros.analysis.truth import compare
 from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.cli.demo import BODY, REQUIREMENTS, measure, prepare
+from mems6dof_ros.figures import Figure, at_most, exactly
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.localization.validation import matched_fits
 from mems6dof_ros.nodes.bodies_validation import bodies_figures
@@ -22,9 +22,6 @@ from mems6dof_ros.nodes.system import chain, replayed, run_system
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.source import open_source
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 #: Numerical noise of the same computation in another process, of m and of rad.
 SAME = 1e-12
@@ -44,37 +41,19 @@ def figures(settings: SimulationSettings, cycles: int, out: Path) -> list[Figure
     ]
 
 
-def _figure(quantity: str, measured: float, most: float) -> Figure:
-    return {
-        "quantity": quantity,
-        "measured": float(measured),
-        "required": f"<= {most:g}",
-        "passed": bool(measured <= most),
-    }
-
-
-def _exactly(quantity: str, measured: float, wanted: float) -> Figure:
-    return {
-        "quantity": quantity,
-        "measured": float(measured),
-        "required": f"{wanted:g}",
-        "passed": bool(measured == wanted),
-    }
-
-
 def _poses(recording: Recording, cycles: int) -> list[Figure]:
     """The demonstration against its truth."""
     poses = [pose for pose in recording.poses[BODY] if pose.valid]
     truths = [truth for truth in recording.truth_of(poses) if truth is not None]
     comparison = compare(poses, truths)
     rows = [
-        _exactly("four processes: frames published", recording.frames, cycles),
-        _exactly("four processes: valid poses", len(poses), cycles),
-        _exactly("four processes: frames lost", recording.frames - len(recording.poses[BODY]), 0),
+        exactly("four processes: frames published", recording.frames, cycles),
+        exactly("four processes: valid poses", len(poses), cycles),
+        exactly("four processes: frames lost", recording.frames - len(recording.poses[BODY]), 0),
     ]
     for name, error, _ in comparison.table():
         need = REQUIREMENTS[name]
-        rows.append(_figure(f"rms error {name}, {need.unit}", error * need.scale, need.limit * need.scale))
+        rows.append(at_most(f"rms error {name}, {need.unit}", error * need.scale, need.limit * need.scale))
     return rows
 
 
@@ -92,8 +71,8 @@ def _record(bag: Path, recording: Recording) -> list[Figure]:
             stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
             unstamped += stamp not in stamps or not header.frame_id
     rows = [
-        _exactly("bag: messages decoded by rosbags", decoded, announced),
-        _exactly("bag: headers without a frame's stamp and frame id", unstamped, 0),
+        exactly("bag: messages decoded by rosbags", decoded, announced),
+        exactly("bag: headers without a frame's stamp and frame id", unstamped, 0),
     ]
     count = incomplete = 0
     for file in sorted(bag.glob("*.mcap")):
@@ -111,8 +90,8 @@ def _record(bag: Path, recording: Recording) -> list[Figure]:
                     and metadata.get("topic_type_hash", "").startswith("RIHS01_")
                 )
                 incomplete += 0 if complete else 1
-    rows.append(_exactly("bag: messages decoded by mcap with mcap-ros2-support", count, announced))
-    rows.append(_exactly("bag: channels without schema, QoS or type hash", incomplete, 0))
+    rows.append(exactly("bag: messages decoded by mcap with mcap-ros2-support", count, announced))
+    rows.append(exactly("bag: channels without schema, QoS or type hash", incomplete, 0))
     return rows
 
 
@@ -142,10 +121,10 @@ def _replay(bag: Path, calibration: Path, out: Path) -> list[Figure]:
     rows = []
     for name in names:
         poses = [pose for pose in load_recording(out / name).poses[BODY] if pose.valid]
-        rows.append(_exactly(f"replay in namespace {name}: valid poses", len(poses), len(expected)))
+        rows.append(exactly(f"replay in namespace {name}: valid poses", len(poses), len(expected)))
         difference = np.array([pose.displacement - expected[pose.stamp_ns] for pose in poses])
         rows.append(
-            _figure(
+            at_most(
                 f"replay in {name}: largest departure from analyze, m or rad", abs(difference).max(), SAME
             )
         )

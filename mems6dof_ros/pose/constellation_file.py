@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mems6dof_ros import __version__
-from mems6dof_ros.documents import read_document
+from mems6dof_ros.documents import read_document, write_whole
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.pose.body_frame import BodyFrame
 
@@ -40,7 +40,8 @@ class ReferenceConstellation:
         return cls(body, constellation.ids[keep].copy(), position, covariance)
 
     def save(self, path: Path) -> None:
-        """Write as JSON, with units and the software's version; replaces ``path`` only when complete."""
+        """Write as JSON, with units and the software's version, whole or not at all; InputError where
+        ``path`` cannot be written."""
         content = {
             "format": FORMAT,
             "format_version": VERSION,
@@ -51,9 +52,7 @@ class ReferenceConstellation:
             "position": self.position.tolist(),
             "covariance": self.covariance.tolist(),
         }
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(json.dumps(content))
-        partial.replace(path)
+        write_whole(path, json.dumps(content))
 
     @classmethod
     def load(cls, path: Path) -> ReferenceConstellation:

@@ -10,12 +10,12 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mems6dof_ros.analysis.truth import TruthComparison, compare
+from mems6dof_ros.figures import Figure, at_most, between, information
 from mems6dof_ros.frame import GroundTruth
 from mems6dof_ros.localization.localizations import Localizations
 from mems6dof_ros.pose.bodies import Bodies
@@ -27,8 +27,6 @@ from mems6dof_ros.pose.synthetic import GearMotion, Scene, SyntheticGear, make_l
 
 Array = NDArray[np.float64]
 
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 #: Limits of issue and demonstration alike: m, m, m, rad, rad, rad.
 LIMITS = np.array([0.26e-9, 0.26e-9, 8e-9, 100e-6, 100e-6, 2.5e-6])
@@ -291,20 +289,6 @@ def figures(
     return table
 
 
-def _row(quantity: str, measured: float, required: str = "", passed: bool | None = None) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
-
-
-def _below(quantity: str, measured: float, limit: float, unit: str = "") -> Figure:
-    return _row(
-        f"{quantity}{', ' + unit if unit else ''}", measured, f"<= {limit:g}", bool(measured <= limit)
-    )
-
-
-def _between(quantity: str, measured: float, low: float, high: float) -> Figure:
-    return _row(quantity, measured, f"{low:g} to {high:g}", bool(low <= measured <= high))
-
-
 _SCALES = {"dx": ("nm", 1e9), "dy": ("nm", 1e9), "dz": ("nm", 1e9)}
 
 
@@ -312,11 +296,8 @@ def _freedoms(what: str, rms: Array, limits: Array | None = None) -> list[Figure
     rows = []
     for index, name in enumerate(DEGREES_OF_FREEDOM):
         unit, scale = _SCALES.get(name, ("urad", 1e6))
-        quantity = f"{what}: {name} rms"
-        if limits is None:
-            rows.append(_row(f"{quantity}, {unit}", rms[index] * scale))
-        else:
-            rows.append(_below(quantity, rms[index] * scale, limits[index] * scale, unit))
+        limit = None if limits is None else limits[index] * scale
+        rows.append(at_most(f"{what}: {name} rms, {unit}", rms[index] * scale, limit))
     return rows
 
 
@@ -335,7 +316,7 @@ def _accuracy(seeds: Sequence[int]) -> list[Figure]:
         for first, last in ((0, 79), (80, 239)) if honest else ((0, 239),):
             nees = float(np.mean([c.between(first, last).nees_per_dof for c in comparisons]))
             label = f"{name}: NEES/6, cycles {first} to {last}"
-            rows.append(_between(label, nees, 0.8, 1.3) if honest else _row(label, nees))
+            rows.append(between(label, nees, 0.8, 1.3) if honest else information(label, nees))
     return rows
 
 
@@ -349,9 +330,9 @@ def _drift(seeds: Sequence[int], cycles: int) -> list[Figure]:
         first, last = result.between(0, 99), result.between(cycles - 100, cycles)
         ratio = float(np.sqrt(np.mean((last.rms / first.rms) ** 2)))
         where = f"{cycles} cycles, seed {seed}"
-        rows.append(_below(f"{where}: error of the last 100 over the first 100", ratio, 1.15))
-        rows.append(_below(f"{where}: wrong identities", run.wrong_identities, 0))
-        rows.append(_below(f"{where}: cycles lost", run.lost, 0))
+        rows.append(at_most(f"{where}: error of the last 100 over the first 100", ratio, 1.15))
+        rows.append(at_most(f"{where}: wrong identities", run.wrong_identities, 0))
+        rows.append(at_most(f"{where}: cycles lost", run.lost, 0))
     return rows
 
 
@@ -362,10 +343,10 @@ def _clutter(seeds: Sequence[int]) -> list[Figure]:
         runs = [follow(Scene(missing=fraction, spurious=fraction), seed, 160) for seed in seeds]
         ratio = error_ratio(runs, clean)
         what = f"{fraction:.0%} missing, {fraction:.0%} spurious"
-        rows.append(_below(f"{what}: error over clean", ratio, limit))
-        rows.append(_below(f"{what}: wrong poses", sum(run.wrong_poses for run in runs), 0))
-        rows.append(_below(f"{what}: cycles lost", sum(run.lost for run in runs), 0))
-        rows.append(_below(f"{what}: wrong identities", sum(run.wrong_identities for run in runs), 0))
+        rows.append(at_most(f"{what}: error over clean", ratio, limit))
+        rows.append(at_most(f"{what}: wrong poses", sum(run.wrong_poses for run in runs), 0))
+        rows.append(at_most(f"{what}: cycles lost", sum(run.lost for run in runs), 0))
+        rows.append(at_most(f"{what}: wrong identities", sum(run.wrong_identities for run in runs), 0))
     return rows
 
 
@@ -375,10 +356,10 @@ def _unsteady(seeds: Sequence[int]) -> list[Figure]:
     ]
     what = "0-30 degrees, stall, reverse, skip, 10 lost"
     return [
-        _below(f"{what}: cycles lost", sum(run.lost for run in runs), 0),
-        _below(f"{what}: wrong poses", sum(run.wrong_poses for run in runs), 0),
-        _below(f"{what}: wrong identities", sum(run.wrong_identities for run in runs), 0),
-        _below(f"{what}: whole turns wrong", sum(run.turns_off() for run in runs), 0),
+        at_most(f"{what}: cycles lost", sum(run.lost for run in runs), 0),
+        at_most(f"{what}: wrong poses", sum(run.wrong_poses for run in runs), 0),
+        at_most(f"{what}: wrong identities", sum(run.wrong_identities for run in runs), 0),
+        at_most(f"{what}: whole turns wrong", sum(run.turns_off() for run in runs), 0),
     ]
 
 
@@ -386,11 +367,11 @@ def _interruptions(seeds: Sequence[int]) -> list[Figure]:
     rows = []
     for kind in ("covered", "shifted", "another"):
         results = [interrupt(kind, seed) for seed in seeds]
-        rows.append(_below(f"view {kind}: poses claimed meanwhile", sum(r.claimed for r in results), 0))
+        rows.append(at_most(f"view {kind}: poses claimed meanwhile", sum(r.claimed for r in results), 0))
         rows.append(
-            _below(f"view {kind}: cycles to recover, at most", max(r.cycles_to_return for r in results), 1)
+            at_most(f"view {kind}: cycles to recover, at most", max(r.cycles_to_return for r in results), 1)
         )
-        rows.append(_below(f"view {kind}: wrong after return", sum(not r.right for r in results), 0))
+        rows.append(at_most(f"view {kind}: wrong after return", sum(not r.right for r in results), 0))
     return rows
 
 
@@ -399,7 +380,7 @@ def _precision(seeds: Sequence[int]) -> list[Figure]:
     for count, ratio in precision((5, 10, 20, 50, 100, 200), seeds, 400).items():
         worst = int(np.argmax(ratio))
         rows.append(
-            _below(
+            at_most(
                 f"{count} particles: error over theory, worst ({DEGREES_OF_FREEDOM[worst]})",
                 ratio[worst],
                 1.15,
@@ -415,11 +396,11 @@ def _bodies(seeds: Sequence[int]) -> list[Figure]:
         what = f"two bodies of {particles} particles, field error 5, 30 nm"
         for body in range(2):
             ratio = error_ratio([joint[body] for joint, _ in runs], [single[body] for _, single in runs])
-            rows.append(_below(f"{what}: error of body {body + 1} over alone", ratio, 1.05))
+            rows.append(at_most(f"{what}: error of body {body + 1} over alone", ratio, 1.05))
             nees = float(np.mean([joint[body].comparison().nees_per_dof for joint, _ in runs]))
-            rows.append(_between(f"{what}: NEES/6 of body {body + 1}", nees, 0.8, 1.3))
+            rows.append(between(f"{what}: NEES/6 of body {body + 1}", nees, 0.8, 1.3))
         wrong = sum(run.wrong_identities + run.lost for joint, _ in runs for run in joint)
-        rows.append(_below(f"{what}: particles of the other body used, cycles lost", wrong, 0))
+        rows.append(at_most(f"{what}: particles of the other body used, cycles lost", wrong, 0))
     return rows
 
 
@@ -432,8 +413,10 @@ def _chained(seeds: Sequence[int]) -> list[Figure]:
         last.append(float(np.sqrt(np.mean(np.square(ends)))))
     nees = np.mean([chained_nees(seed) for seed in range(1, 4 * len(seeds) + 1)])
     return [
-        _row("reference previous: psi error after two revolutions over that of map", last[0] / last[1]),
-        _between("reference previous: NEES/6 from the first micrograph on", float(nees), 0.8, 1.3),
+        information(
+            "reference previous: psi error after two revolutions over that of map", last[0] / last[1]
+        ),
+        between("reference previous: NEES/6 from the first micrograph on", float(nees), 0.8, 1.3),
     ]
 
 
@@ -448,21 +431,21 @@ def _small(seeds: Sequence[int]) -> list[Figure]:
     ):
         comparisons = [follow(scene, seed, 160).comparison() for seed in seeds]
         nees = float(np.mean([c.nees_per_dof for c in comparisons]))
-        rows.append(_between(f"{name}, field error 5, 30 nm: NEES/6", nees, 0.8, 1.3))
+        rows.append(between(f"{name}, field error 5, 30 nm: NEES/6", nees, 0.8, 1.3))
         tilt = [((c.error / c.claimed)[:, 3:5] ** 2).mean() for c in comparisons]
-        rows.append(_between(f"{name}, field error 5, 30 nm: the same of the tilt", np.mean(tilt), 0.8, 1.3))
+        rows.append(between(f"{name}, field error 5, 30 nm: the same of the tilt", np.mean(tilt), 0.8, 1.3))
     return rows
 
 
 def _time(seeds: Sequence[int]) -> list[Figure]:
     pose, learning = (np.concatenate(part) * 1e3 for part in zip(*map(solve_time, seeds[:2]), strict=True))
     return [
-        _below(
-            "100 particles: solve, association and map included, median", np.median(pose + learning), 1, "ms"
+        at_most(
+            "100 particles: solve, association and map included, median, ms", np.median(pose + learning), 1
         ),
-        _row("100 particles: until the pose is out, median, ms", float(np.median(pose))),
-        _row("100 particles: until the pose is out, slowest, ms", pose.max()),
-        _row("100 particles: learning after it, slowest (map solved), ms", learning.max()),
+        information("100 particles: until the pose is out, median, ms", float(np.median(pose))),
+        information("100 particles: until the pose is out, slowest, ms", pose.max()),
+        information("100 particles: learning after it, slowest (map solved), ms", learning.max()),
     ]
 
 
@@ -472,10 +455,10 @@ def _optics(seed: int, cycles: int) -> list[Figure]:
     result = optical_chain(seed, cycles)
     what = f"rendered frames, seed {seed}"
     rows = _freedoms(f"{what}, after self-calibration", result.settled.rms, LIMITS)
-    rows.append(_between(f"{what}, after self-calibration: NEES/6", result.settled.nees_per_dof, 0.8, 1.3))
-    rows.append(_between(f"{what}, all cycles: NEES/6", result.comparison.nees_per_dof, 0.8, 1.3))
+    rows.append(between(f"{what}, after self-calibration: NEES/6", result.settled.nees_per_dof, 0.8, 1.3))
+    rows.append(between(f"{what}, all cycles: NEES/6", result.comparison.nees_per_dof, 0.8, 1.3))
     rows += _freedoms(f"{what}, all cycles", result.comparison.rms)
     rows += _freedoms(f"{what}, Cramer-Rao bound of all visible", result.bound)
     tilt = np.hypot(*result.comparison.microscope.rotation[:2, 2])
-    rows.append(_row(f"{what}: tilt of the calibrated plane, urad", tilt * 1e6))
+    rows.append(information(f"{what}: tilt of the calibrated plane, urad", tilt * 1e6))
     return rows

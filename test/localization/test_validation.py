@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mems6dof_ros.cli.main import main
+from mems6dof_ros.figures import at_most, information
 from mems6dof_ros.localization import validation
 
 
@@ -28,8 +29,8 @@ def test_command_writes_what_it_measured(printed: Path) -> None:
 
 
 def test_a_figure_that_misses_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    missed = validation._figure("rms", 1.06, high=1.05)
-    monkeypatch.setattr(validation, "figures", lambda *_: [missed, validation._figure("rate", 10.0)])
+    rows = [at_most("rms", 1.06, 1.05), information("rate", 10.0)]
+    monkeypatch.setattr(validation, "figures", lambda *_: rows)
     assert main(["validate", "localization"]) == 1
     output = capsys.readouterr().out
     assert "FAIL" in output

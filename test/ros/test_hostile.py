@@ -7,13 +7,14 @@ from pathlib import Path
 import pytest
 from peers import SMALL_GEAR
 
+from mems6dof_ros.figures import Figure
 from mems6dof_ros.nodes import hostile
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 SETTINGS = SimulationSettings(**SMALL_GEAR)
 
 
-def assert_passed(rows: list[hostile.Figure], least: int) -> None:
+def assert_passed(rows: list[Figure], least: int) -> None:
     verdicts = [row["passed"] for row in rows if row["passed"] is not None]
     assert len(verdicts) >= least
     assert all(verdicts), rows

@@ -17,6 +17,7 @@ from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.figures import Figure, at_least, at_most, exactly
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.nodes.hostile import calibrate_quickly
@@ -27,7 +28,6 @@ from mems6dof_ros.recording.bag import BagWriter
 from mems6dof_ros.recording.definitions import definition, typestore
 from mems6dof_ros.recording.frames import camera_to_json
 from mems6dof_ros.recording.messages import Message
-from mems6dof_ros.recording.validation.rows import Figure, at_least, at_most, exactly
 from mems6dof_ros.simulation.experiment import motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.bag import BagSource

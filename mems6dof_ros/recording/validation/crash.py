@@ -19,9 +19,9 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from mems6dof_ros.cli.main import main
+from mems6dof_ros.figures import Figure, exactly, information
 from mems6dof_ros.recording.recover import mcap_files
 from mems6dof_ros.recording.validation.processes import kill, traffic, until, witnessed_recorder
-from mems6dof_ros.recording.validation.rows import Figure, exactly, information
 from mems6dof_ros.recording.validation.traffic import CYCLE, Journal
 
 KILLS = 50

@@ -16,6 +16,7 @@ from mems6dof_msgs.msg import Pose6DOF
 from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.figures import Figure, at_least, exactly, information, remark
 from mems6dof_ros.nodes.bystander import Bystander
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
 from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
@@ -23,7 +24,6 @@ from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.recording.validation.bags import SMALL, with_camera
 from mems6dof_ros.recording.validation.processes import witnessed_recorder
-from mems6dof_ros.recording.validation.rows import Figure, at_least, exactly, information
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 #: Of the disk that is filled, and what the recorder must leave of it, MiB.
@@ -41,7 +41,7 @@ def figures(work: Path, seed: int, tell: Callable[[str], None], seconds: float =
         with small_disk(work / "disk") as disk:
             yield from full(disk, seed, seconds)
     except PermissionError as reason:
-        yield information(f"full disk: not measured, {reason}", float("nan"))
+        yield remark(f"full disk: not measured, {reason}")
     tell("a disk that is too slow")
     yield from slow(work / "slow", seed, seconds)
     tell("a recorder beside a run")

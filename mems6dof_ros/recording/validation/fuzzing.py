@@ -18,6 +18,7 @@ import numpy as np
 import tifffile
 from rosbags.rosbag2 import StoragePlugin
 
+from mems6dof_ros.figures import Figure, at_most, exactly, information
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import AUTOSTART
@@ -27,7 +28,6 @@ from mems6dof_ros.pose.constellation_file import ReferenceConstellation
 from mems6dof_ros.recording.validation.bags import write_mcap_ros2, write_ours, write_rosbags
 from mems6dof_ros.recording.validation.mutation import contradicted, damaged, to_json, to_yaml
 from mems6dof_ros.recording.validation.reading import Answer
-from mems6dof_ros.recording.validation.rows import Figure, at_most, exactly, information
 
 #: How many of each kind.
 FILES = {

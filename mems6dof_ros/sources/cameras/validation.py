@@ -9,21 +9,18 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mems6dof_ros.errors import Mems6dofError
-from mems6dof_ros.frame import NAN, Frame
+from mems6dof_ros.figures import Figure, between, exactly, figure, information, remark
+from mems6dof_ros.frame import Frame
 from mems6dof_ros.nodes import camera_validation
 from mems6dof_ros.sources.cameras.basler import BaslerSource
 from mems6dof_ros.sources.cameras.camera import CameraSource
 from mems6dof_ros.sources.cameras.emulation import GigeEmulator, WireCounter, basler_emulator
 from mems6dof_ros.sources.cameras.genicam import GenicamSource
-
-#: One row of the table: quantity, measured, required (text), passed (None: for information).
-Figure = dict[str, Any]
 
 _EXPOSURE = 0.01
 
@@ -43,7 +40,7 @@ def figures(
         try:
             table += [{**row, "quantity": f"{name}: {row['quantity']}"} for row in part(seconds, size, rate)]
         except (Mems6dofError, PermissionError) as reason:
-            table.append(_information(f"{name}: not measured, {reason}", NAN))
+            table.append(remark(f"{name}: not measured, {reason}"))
     return table
 
 
@@ -59,16 +56,18 @@ def gige_stream(seconds: float, size: int, rate: float) -> Iterator[Figure]:
         status, produced = source.status, wire.produced
         source.stop()
     settled = errors[len(errors) // 2 :]
-    yield _information("frames produced", produced)
-    yield _information("frames per second", (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9))
-    yield _information("reported lost", status.lost + status.pending)
-    yield _exact("produced - delivered - lost", produced - status.delivered - status.lost - status.pending)
-    yield _exact("stamps that do not ascend", sum(b <= a for a, b in pairwise(stamps)))
-    yield _exact("images that are not whole (every 10th looked at)", broken)
-    yield _information("stamp error, mean, ms", float(np.mean(settled)) * 1e3)
-    yield _information("stamp error, standard deviation, ms", float(np.std(settled)) * 1e3)
+    yield information("frames produced", produced)
+    yield information("frames per second", (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9))
+    yield information("reported lost", status.lost + status.pending)
+    yield exactly(
+        "produced - delivered - lost", produced - status.delivered - status.lost - status.pending, 0
+    )
+    yield exactly("stamps that do not ascend", sum(b <= a for a, b in pairwise(stamps)), 0)
+    yield exactly("images that are not whole (every 10th looked at)", broken, 0)
+    yield information("stamp error, mean, ms", float(np.mean(settled)) * 1e3)
+    yield information("stamp error, standard deviation, ms", float(np.std(settled)) * 1e3)
     within = math.sqrt(float(np.mean(np.square(settled)))) / status.stamp_uncertainty
-    yield _figure("stamp error, rms / stated uncertainty", within, "< 2", within < 2)
+    yield figure("stamp error, rms / stated uncertainty", within, "< 2", within < 2)
 
 
 def gige_losses(seconds: float, size: int, rate: float) -> Iterator[Figure]:
@@ -80,10 +79,10 @@ def gige_losses(seconds: float, size: int, rate: float) -> Iterator[Figure]:
         status, produced = source.status, wire.produced
         source.stop()
     unknown = produced - status.delivered - status.lost - status.pending
-    yield _information("delivered whole, share", status.delivered / produced)
-    yield _exact("images that are not whole", broken)
+    yield information("delivered whole, share", status.delivered / produced)
+    yield exactly("images that are not whole", broken, 0)
     # Before the first whole frame nothing tells of a loss.
-    yield _figure("produced - delivered - lost", unknown, "0 to 8", 0 <= unknown <= 8)
+    yield between("produced - delivered - lost", unknown, 0, 8)
 
 
 def gige_restart(seconds: float, size: int, rate: float) -> Iterator[Figure]:
@@ -112,10 +111,10 @@ def gige_restart(seconds: float, size: int, rate: float) -> Iterator[Figure]:
     assert before is not None  # a live source has no end
     assert frame is not None
     away = (frame.device_time_ns - before.device_time_ns) * 1e-9
-    yield _information("without frames, s", away)
-    yield _figure("from its restart to the next frame, s", resumed, "< 10", resumed < 10)
-    yield _figure("reported lost", frame.frames_dropped, "> 0", frame.frames_dropped > 0)
-    yield _information("reported lost per second without frames, Hz", frame.frames_dropped / away)
+    yield information("without frames, s", away)
+    yield figure("from its restart to the next frame, s", resumed, "< 10", resumed < 10)
+    yield figure("reported lost", frame.frames_dropped, "> 0", frame.frames_dropped > 0)
+    yield information("reported lost per second without frames, Hz", frame.frames_dropped / away)
 
 
 def basler(seconds: float, size: int, rate: float) -> Iterator[Figure]:
@@ -135,10 +134,10 @@ def basler(seconds: float, size: int, rate: float) -> Iterator[Figure]:
             different += not np.array_equal(frame.image, images[(first + frame.frame_counter) % 6])
         elapsed, status = time.monotonic() - began, source.status
         source.stop()
-    yield _information("triggers", triggers)
-    yield _information("frames per second", status.delivered / elapsed)
-    yield _exact("triggers - delivered - lost", triggers - status.delivered - status.lost)
-    yield _exact("images that differ from ours", different)
+    yield information("triggers", triggers)
+    yield information("frames per second", status.delivered / elapsed)
+    yield exactly("triggers - delivered - lost", triggers - status.delivered - status.lost, 0)
+    yield exactly("images that differ from ours", different, 0)
 
 
 def _gige(emulator: GigeEmulator, size: int, rate: float) -> CameraSource:
@@ -174,15 +173,3 @@ def _read_for(source: CameraSource, seconds: float, unplug: Callable[[], None]) 
 def _whole(image: NDArray[np.generic]) -> bool:
     """The emulator draws a ramp of x + y + frame id: a stretch of another frame breaks it."""
     return bool((image[1:, :-1] == image[:-1, 1:]).all())
-
-
-def _figure(quantity: str, measured: float, required: str, passed: bool | None) -> Figure:
-    return {"quantity": quantity, "measured": float(measured), "required": required, "passed": passed}
-
-
-def _exact(quantity: str, measured: float) -> Figure:
-    return _figure(quantity, measured, "0", measured == 0)
-
-
-def _information(quantity: str, measured: float) -> Figure:
-    return _figure(quantity, measured, "", None)

@@ -95,7 +95,7 @@ def test_the_installed_nodes_run(install: Path, tmp_path: Path) -> None:
     )
     result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, cwd=tmp_path, timeout=60)
     assert result.returncode == 1
-    assert result.stderr.startswith("error: absent.yaml")
+    assert "\nerror: absent.yaml" in result.stderr
     where = "import mems6dof_ros, mems6dof_msgs.msg as m; print(mems6dof_ros.__file__, m.__file__)"
     command = f". {install / 'setup.sh'} && exec {sys.executable} -c '{where}'"
     result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, cwd=tmp_path, timeout=60)

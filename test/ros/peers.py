@@ -102,9 +102,14 @@ class Peer:
         """The response of a service."""
         client = self.node.create_client(kind, service)
         assert client.wait_for_service(PATIENCE)
-        answer = client.call_async(request or kind.Request())
-        self.wait(answer.done)
-        return answer.result()
+        # A server answers into the void where, on a busy machine, it has not yet discovered the client's
+        # reader (rmw_fastrtps waits 0.1 s for it): ask once more.
+        for patience in (PATIENCE / 6, PATIENCE):
+            answer = client.call_async(request or kind.Request())
+            with self._changed:
+                if self._changed.wait_for(answer.done, patience):
+                    return answer.result()
+        raise AssertionError(f"{service} does not answer")
 
     def close(self) -> None:
         self._closing = True

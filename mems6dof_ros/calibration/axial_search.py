@@ -115,6 +115,94 @@ def search_defocus(
 
 
 @njit(**_OPTIONS)
+def linearize(
+    noise: Array,
+    local: Array,
+    defocus: Array,
+    interval: tuple[float, float],
+    used: NDArray[np.int64],
+    nodes: Array,
+    scatter: Array,
+) -> tuple[Array, Array]:
+    """The apparent lateral motion (n, 2) of n particles at their ``defocus`` (n,) m, and the covariance
+    (n, 3, 3) m^2 of their corrected positions, linearised there.
+
+    ``noise`` (n, f, f) of all features, of which ``used`` (k,) have told the defocus and the first two are
+    the lateral motion; ``local`` (n, f, m): Chebyshev coefficients of each particle's curves over
+    ``interval``; ``nodes`` (g,) m, equidistant, with ``scatter`` (g, f, f), interpolated linearly.
+    """
+    count, f, terms = local.shape
+    k = len(used)
+    motion = np.empty((count, 2))
+    covariance = np.empty((count, 3, 3))
+    slope, total = np.empty(f), np.empty((f, f))
+    factor, weighted = np.empty((k, k)), np.empty(k)
+    jacobian, product = np.empty((3, f)), np.empty(f)
+    scale = 2 / (interval[1] - interval[0])
+    for i in range(count):
+        at = (2 * defocus[i] - (interval[0] + interval[1])) / (interval[1] - interval[0])
+        values = np.zeros(2)
+        slope[:] = 0.0
+        before, here = 1.0, at  # T_0, T_1 and the derivatives
+        slope_before, slope_here = 0.0, 1.0
+        for m in range(terms):
+            for a in range(f):
+                slope[a] += scale * local[i, a, m] * slope_before
+            for a in range(2):
+                values[a] += local[i, a, m] * before
+            before, here, slope_before, slope_here = (
+                here,
+                2 * at * here - before,
+                slope_here,
+                2 * here + 2 * at * slope_here - slope_before,
+            )
+        motion[i] = values
+        place = min(max((defocus[i] - nodes[0]) / (nodes[1] - nodes[0]), 0.0), len(nodes) - 1.0)
+        left = min(int(place), len(nodes) - 2)
+        for a in range(f):
+            for b in range(f):
+                total[a, b] = (
+                    noise[i, a, b]
+                    + (1 - (place - left)) * scatter[left, a, b]
+                    + (place - left) * scatter[left + 1, a, b]
+                )
+        for a in range(k):
+            for b in range(a + 1):
+                factor[a, b] = total[used[a], used[b]]
+        _factorize(factor, k)
+        information = 0.0
+        for a in range(k):  # forward, and then back
+            weighted[a] = slope[used[a]]
+            for c in range(a):
+                weighted[a] -= factor[a, c] * weighted[c]
+            weighted[a] /= factor[a, a]
+            information += weighted[a] * weighted[a]
+        for a in range(k - 1, -1, -1):
+            for c in range(a + 1, k):
+                weighted[a] -= factor[c, a] * weighted[c]
+            weighted[a] /= factor[a, a]
+        jacobian[:] = 0.0
+        for a in range(k):
+            gain = weighted[a] / information
+            jacobian[2, used[a]] = gain
+            jacobian[0, used[a]] = -slope[0] * gain
+            jacobian[1, used[a]] = -slope[1] * gain
+        jacobian[0, 0] += 1.0
+        jacobian[1, 1] += 1.0
+        for r in range(3):
+            for b in range(f):
+                product[b] = 0.0
+                for a in range(f):
+                    product[b] += jacobian[r, a] * total[a, b]
+            for c in range(3):
+                entry = 0.0
+                for b in range(f):
+                    entry += product[b] * jacobian[c, b]
+                covariance[i, r, c] = entry
+    return motion, covariance
+
+
+@njit(**_OPTIONS)
 def _combine(coefficients: Array, basis: Array, curves: Array) -> None:
     """``curves = coefficients @ basis``."""
     curves[:] = 0.0

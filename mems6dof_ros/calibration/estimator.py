@@ -19,7 +19,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from mems6dof_ros.calibration.axial_search import search_defocus
+from mems6dof_ros.calibration.axial_search import linearize, search_defocus
 from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.interface import Positions
 from mems6dof_ros.calibration.moments import MOMENTS, Moments
@@ -177,22 +177,12 @@ class Estimator:
         self, measured: Array, noise: Array, local: Array, u: Array, focus: Array
     ) -> tuple[Array, Array]:
         """Positions (n, 3) at defocus ``u`` with their covariance (n, 3, 3), linearised there."""
-        model, used = self._model, self._used
-        total = noise + model.scatter_at(u)
-        slope = model.curves.slopes(local, u)
-        values = model.curves.values(local, u)
-        tangent = slope[:, used]
-        weighted = np.linalg.solve(total[:, used[:, None], used[None, :]], tangent[:, :, None])[:, :, 0]
-        information = np.einsum("nk,nk->n", tangent, weighted)
-        gain = np.zeros((len(u), len(FEATURES)))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            gain[:, used] = weighted / information[:, None]
-            jacobian = np.stack([-slope[:, :1] * gain, -slope[:, 1:2] * gain, gain], axis=1)
-            jacobian[:, 0, 0] += 1
-            jacobian[:, 1, 1] += 1
-            covariance = jacobian @ total @ jacobian.transpose(0, 2, 1)
+        model = self._model
+        motion, covariance = linearize(
+            noise, local, u, model.curves.interval, self._used, model.nodes, model.scatter
+        )
         covariance[:, 2, 2] += model.focus_variance
-        position = np.stack([measured[:, 0] - values[:, 0], measured[:, 1] - values[:, 1], u + focus], axis=1)
+        position = np.column_stack([measured[:, :2] - motion, u + focus])
         return position, covariance
 
     def _mixture(self, position: Array, covariance: Array, other: tuple[Array, Array], gap: Array) -> Array:

@@ -12,10 +12,12 @@ surface f holds field curvature and tilt, zero on the axis.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
 from mems6dof_ros.calibration.moments import MOMENTS, Moments
@@ -111,26 +113,51 @@ def features(
     amplitude over flux, in px^-2; with A = flux / (2 pi sigma_x sigma_y sqrt(1 - rho^2)) the paper's
     rho_amp = rho A(rho*) / A becomes 2 pi exp(log_reference) sigma_x sigma_y rho sqrt(1 - rho^2).
     """
-    x, y, _, sigma_x, sigma_y, rho, _ = fits.parameters.T
-    complement = 1 - rho**2
-    scale = 2 * np.pi * np.exp(log_reference) * sigma_x * sigma_y
-    rho_amp = scale * rho * np.sqrt(complement)
     values = np.full((len(fits), len(FEATURES)), np.nan)
-    values[:, :_FITTED] = np.stack(
-        [x * pixel_size, y * pixel_size, np.log(sigma_x), np.log(sigma_y), np.arctanh(rho), rho_amp], axis=1
-    )
-    jacobian = np.zeros((len(fits), _FITTED, 7))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = pixel_size
-    jacobian[:, 2, 3] = 1 / sigma_x
-    jacobian[:, 3, 4] = 1 / sigma_y
-    jacobian[:, 4, 5] = 1 / complement
-    jacobian[:, 5, 3] = rho_amp / sigma_x
-    jacobian[:, 5, 4] = rho_amp / sigma_y
-    jacobian[:, 5, 5] = scale * (1 - 2 * rho**2) / np.sqrt(complement)
     covariance = np.zeros((len(fits), len(FEATURES), len(FEATURES)))
-    covariance[:, :_FITTED, :_FITTED] = jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
+    _shape(fits.parameters, fits.covariance, pixel_size, log_reference, values, covariance)
     if moments is not None:
         # The residual of a well-weighted fit is all but uncorrelated with its parameters.
         values[:, _FITTED:] = moments.values
         covariance[:, _FITTED:, _FITTED:] = moments.covariance
     return values, covariance
+
+
+@njit(cache=True, nogil=True)
+def _shape(
+    parameters: Array,
+    parameter_covariance: Array,
+    pixel_size: float,
+    log_reference: Array,
+    values: Array,
+    covariance: Array,
+) -> None:
+    """Write the first _FITTED features and their covariance."""
+    jacobian = np.zeros((_FITTED, 7))
+    jacobian[0, 0] = jacobian[1, 1] = pixel_size
+    product = np.empty(7)
+    for i in range(len(parameters)):
+        x, y, rho = parameters[i, 0], parameters[i, 1], parameters[i, 5]
+        sigma_x, sigma_y = parameters[i, 3], parameters[i, 4]
+        complement = 1 - rho**2
+        root = math.sqrt(complement)
+        scale = 2 * math.pi * math.exp(log_reference[i]) * sigma_x * sigma_y
+        rho_amp = scale * rho * root
+        values[i, 0], values[i, 1] = x * pixel_size, y * pixel_size
+        values[i, 2], values[i, 3] = math.log(sigma_x), math.log(sigma_y)
+        values[i, 4], values[i, 5] = math.atanh(rho), rho_amp
+        jacobian[2, 3] = 1 / sigma_x
+        jacobian[3, 4] = 1 / sigma_y
+        jacobian[4, 5] = 1 / complement
+        jacobian[5, 3], jacobian[5, 4] = rho_amp / sigma_x, rho_amp / sigma_y
+        jacobian[5, 5] = scale * (1 - 2 * rho**2) / root
+        for a in range(_FITTED):
+            for q in range(7):
+                product[q] = 0.0
+                for p in range(7):
+                    product[q] += jacobian[a, p] * parameter_covariance[i, p, q]
+            for b in range(_FITTED):
+                entry = 0.0
+                for q in range(7):
+                    entry += product[q] * jacobian[b, q]
+                covariance[i, a, b] = entry

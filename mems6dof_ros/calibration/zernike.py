@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 
@@ -27,24 +27,47 @@ def zernike_order(terms: int) -> int:
 
 def zernike(order: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """All terms up to radial ``order`` at ``x``, ``y`` (n,) in units of the disc's radius: (n, terms)."""
-    azimuthal = [np.ones(len(x), dtype=np.complex128)]
-    for _ in range(order):
-        azimuthal.append(azimuthal[-1] * (x + 1j * y))
-    radius2 = x**2 + y**2
-    terms = []
-    for n in range(order + 1):
-        for m in range(-n, n + 1, 2):
-            angular = azimuthal[abs(m)].imag if m < 0 else azimuthal[abs(m)].real
-            norm = math.sqrt(n + 1) if m == 0 else math.sqrt(2 * (n + 1))
-            radial: Any
-            radial, *lower = _radial_coefficients(n, abs(m))
-            for coefficient in lower:
-                radial = radial * radius2 + coefficient
-            terms.append(norm * radial * angular)
-    return np.stack(terms, axis=1)
+    return np.asarray(_evaluate(x, y, order, *_table(order)))
 
 
-@lru_cache(maxsize=256)
+@njit(cache=True, nogil=True)
+def _evaluate(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    order: int,
+    azimuthal: NDArray[np.int64],
+    radial: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    out = np.empty((len(x), len(azimuthal)))
+    cosine, sine = np.empty(order + 1), np.empty(order + 1)  # r^m cos m phi, r^m sin m phi
+    for i in range(len(x)):
+        cosine[0], sine[0] = 1.0, 0.0
+        for m in range(order):
+            cosine[m + 1] = cosine[m] * x[i] - sine[m] * y[i]
+            sine[m + 1] = cosine[m] * y[i] + sine[m] * x[i]
+        radius2 = x[i] ** 2 + y[i] ** 2
+        for j in range(len(azimuthal)):
+            value = 0.0
+            for coefficient in radial[j]:
+                value = value * radius2 + coefficient
+            m = azimuthal[j]
+            out[i, j] = value * (sine[-m] if m < 0 else cosine[m])
+    return out
+
+
+@lru_cache(maxsize=32)
+def _table(order: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Of each term m (terms,), and its norm times the coefficients of R_n^m(r) / r^m in powers of r^2,
+    highest first, (terms, powers)."""
+    terms = [(n, m) for n in range(order + 1) for m in range(-n, n + 1, 2)]
+    radial = np.zeros((len(terms), order // 2 + 1))
+    for j, (n, m) in enumerate(terms):
+        coefficients = _radial_coefficients(n, abs(m))
+        norm = math.sqrt(n + 1) if m == 0 else math.sqrt(2 * (n + 1))
+        radial[j, radial.shape[1] - len(coefficients) :] = norm * np.array(coefficients)
+    return np.array([m for _, m in terms]), radial
+
+
 def _radial_coefficients(n: int, m: int) -> list[float]:
     """Coefficients of R_n^m(r) / r^m in powers of r^2, highest first."""
     return [

@@ -3,7 +3,8 @@
 Everything localized is remembered in the frame of the body, flagged or not: a disturbed neighbour must stay
 known, and a particle that leaves the field comes back. The motion of the last cycles, continued, tells
 where to fit. A Gaussian fit follows its particle, so that the result does not depend on the start. Whole
-frames are searched now and then for newcomers, and whenever too few particles are found.
+frames are searched now and then for newcomers, after their result is out, and whenever too few particles
+are found.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
+from mems6dof_ros.localization.detection import detect
 from mems6dof_ros.localization.localizations import Flag, Localizations
 from mems6dof_ros.localization.localizer import Localizer
 
@@ -61,8 +63,9 @@ class TrackingLocalizer:
     """A Localizer that is told the poses and needs no detection in most frames; for one body.
 
     ``localize`` each frame, and ``observe`` the pose of every cycle as it becomes known, in time for the
-    next frame or a few later. Without poses every frame is searched. ``detections`` counts searched frames.
-    Not safe for several threads.
+    next frame or a few later. Without poses every frame is searched. ``search``, when the result of a frame
+    is out, looks for newcomers if it is time; otherwise the next ``localize`` begins with it.
+    ``detections`` counts searched frames. Not safe for several threads.
     """
 
     def __init__(self, localizer: Localizer, settings: TrackingSettings | None = None) -> None:
@@ -71,6 +74,7 @@ class TrackingLocalizer:
         self.detections = 0
         self._found: deque[tuple[Localizations, Array]] = deque(maxlen=2 * _MOST_CYCLES)
         self._since_detection = 0
+        self._to_search: Frame | None = None
         self._forget(-1)
 
     def _forget(self, version: int) -> None:
@@ -78,9 +82,11 @@ class TrackingLocalizer:
         self._motions: deque[_Motion] = deque(maxlen=2)
         self._places, self._misses = np.empty((0, 3)), np.empty(0, np.int64)
         self._trusted = np.empty(0, bool)  # good when last seen
+        self._newcomers = -1, np.empty((0, 2))  # cycle, and where they were in the microscope frame, m
 
     def localize(self, frame: Frame) -> Localizations:
         """As Localizer.localize, errors included."""
+        self.search()
         pixel_size = self.localizer.check(frame)
         half_field = np.array(frame.image.shape[::-1]) * pixel_size / 2
         found = self._track(frame, pixel_size, half_field)
@@ -89,13 +95,30 @@ class TrackingLocalizer:
             found = self.localizer.localize(frame)
             self.detections += 1
             self._since_detection = 0
+        elif self._since_detection >= self.settings.detection_period:
+            self._to_search = frame
         self._found.append((found, half_field))
         return found
 
+    def search(self) -> None:
+        """Look for newcomers in the last frame, where it is time; they are fitted from the next frame on."""
+        frame, self._to_search = self._to_search, None
+        if frame is None:
+            return
+        self.detections += 1
+        self._since_detection = 0
+        found, half_field = self._found[-1]
+        pixel_size = self.localizer.check(frame)
+        place = (detect(frame.image, self.localizer.settings.detection) + 0.5) * pixel_size - half_field
+        known = found.position[np.isfinite(found.position[:, :2]).all(axis=1), :2]
+        if len(known) and len(place):
+            place = place[cKDTree(known).query(place)[0] > _SAME]
+        self._newcomers = frame.cycle, place
+        for motion in self._motions:
+            self._welcome(motion)
+
     def _track(self, frame: Frame, pixel_size: float, half_field: Array) -> Localizations | None:
         """Localizations from where known particles should be; None: the frame must be searched."""
-        if self._since_detection + 1 >= self.settings.detection_period:
-            return None
         place, trusted = self._expected(frame.cycle, half_field)
         if not trusted.any():
             return None
@@ -113,6 +136,7 @@ class TrackingLocalizer:
         for found, half_field in self._found:
             if found.cycle == cycle:
                 self._remember(found, half_field, transform)
+        self._welcome(self._motions[-1])
 
     def _remember(self, found: Localizations, half_field: Array, transform: Array) -> None:
         fitted = (found.flags & np.uint32(Flag.FIT_FAILED)) == 0
@@ -132,6 +156,18 @@ class TrackingLocalizer:
         self._places = np.concatenate([self._places[stay], place[fresh]])
         self._trusted = np.concatenate([self._trusted[stay], good[fresh]])
         self._misses = np.concatenate([self._misses[stay], np.zeros(int(fresh.sum()), np.int64)])
+
+    def _welcome(self, motion: _Motion) -> None:
+        """Expect the newcomers of the cycle of ``motion`` from now on, at the height of the body."""
+        cycle, place = self._newcomers
+        if cycle != motion.cycle:
+            return
+        transform = motion.transform
+        position = np.column_stack([place, np.full(len(place), transform[2, 3])])
+        self._places = np.concatenate([self._places, (position - transform[:3, 3]) @ transform[:3, :3]])
+        self._trusted = np.concatenate([self._trusted, np.zeros(len(place), bool)])
+        self._misses = np.concatenate([self._misses, np.zeros(len(place), np.int64)])
+        self._newcomers = -1, np.empty((0, 2))
 
     def _expected(self, cycle: int, half_field: Array) -> tuple[Array, Mask]:
         """Where particles should be in ``cycle``, (n, 2) m, and which should give good fits, (n,); none where

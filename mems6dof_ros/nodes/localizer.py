@@ -143,6 +143,7 @@ class LocalizationOutput:
         health.set("particles", len(found))
         health.time("localization", found.latency.localization)
         if self.tracker:
+            self.tracker.search()
             health.set("frames searched", self.tracker.detections)
 
 

@@ -136,7 +136,6 @@ def test_newcomers_are_found_after_their_frame_is_out(frames: list[Frame], delay
         )
         wanted += len(distance)
         got += int((distance < 10e-9).sum())
-    assert (
-        got >= 0.95 * wanted
-    )  # who is new is missing for four frames, and two or three until the pose is known
+    # A newcomer is missing for up to four frames, and until the pose of the one that showed it is known.
+    assert got >= 0.9 * wanted
     assert tracking.detections <= len(frames) / 4 + 4

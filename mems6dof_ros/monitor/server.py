@@ -118,7 +118,8 @@ class MonitorServer:
     def stop(self) -> None:
         """Close every page and the port."""
         if self._loop and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stopping.set)
+            with suppress(RuntimeError):  # the loop has just been closed: it ends by itself
+                self._loop.call_soon_threadsafe(self._stopping.set)
             self._thread.join(timeout=5)
 
     def _run(self) -> None:

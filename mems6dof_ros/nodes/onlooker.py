@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.stream import OutOfExecutor
 
 _NICENESS = 10
 
@@ -28,19 +28,6 @@ def give_way() -> None:
             Path("/proc/self/autogroup").write_text(str(_NICENESS), encoding="utf-8")
 
 
-class _NeverWaitedFor(CallbackGroup):
-    """Keeps what is in it out of what an executor waits for."""
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
-
 class PolledSubscriptions:
     """Serialized messages, acted on every ``period`` s, topic after topic in the order of subscription; after
     that, ``then`` is called. A message of a later topic finds those that were published before it.
@@ -52,7 +39,7 @@ class PolledSubscriptions:
 
     def __init__(self, node: Node, period: float, then: Callable[[], None] = lambda: None) -> None:
         self._node = node
-        self._group = _NeverWaitedFor()
+        self._group = OutOfExecutor()
         self._taken: list[tuple[Any, Callable[[bytes], None]]] = []
         self._then = then
         # Wall time: a page is looked at also while simulated time stands still.

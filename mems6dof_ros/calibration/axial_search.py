@@ -202,7 +202,7 @@ def linearize(
     return motion, covariance
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _combine(coefficients: Array, basis: Array, curves: Array) -> None:
     """``curves = coefficients @ basis``."""
     curves[:] = 0.0
@@ -213,7 +213,7 @@ def _combine(coefficients: Array, basis: Array, curves: Array) -> None:
                 curves[a, g] += c * basis[m, g]
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _levels(noise: Array, scatter: Array, residuals: Array, factors: Array, levels: Array) -> None:
     """``levels = r' C^-1 r + ln det C`` for ``C = noise + scatter`` at every grid point.
 
@@ -248,7 +248,7 @@ def _levels(noise: Array, scatter: Array, residuals: Array, factors: Array, leve
         levels[g] += np.log(determinant[g])
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _factorize(matrix: Array, k: int) -> float:
     """Cholesky factor in place (lower triangle); returns ln det."""
     log_det = 0.0
@@ -266,7 +266,7 @@ def _factorize(matrix: Array, k: int) -> float:
     return log_det
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _products(factor: Array, residual: Array, tangent: Array, k: int) -> tuple[float, float, float]:
     """r'C^-1 r, t'C^-1 r and t'C^-1 t from the Cholesky factor of C; overwrites r and t."""
     chi = 0.0

@@ -42,7 +42,7 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _taps(shift: float, value: Array, slope: Array) -> int:
     """Weights of the pixels ``first .. first + 5`` about a pixel for the value of an image moved by ``shift``
     px there, and for its derivative by the shift; returns ``first``."""
@@ -60,7 +60,7 @@ def _taps(shift: float, value: Array, slope: Array) -> int:
     return int(whole) - 2
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _moved(source: Array, size: int, window: int, first: int, taps: Array, rows: Array, out: Array, at: int,
            taps_y: Array) -> None:  # fmt: skip
     """``out``: the window of ``source`` (size, size) filtered along x with ``taps``, along y with ``taps_y``;
@@ -82,7 +82,7 @@ def _moved(source: Array, size: int, window: int, first: int, taps: Array, rows:
                 line[c] += weight * source_row[c]
 
 
-@njit(**_OPTIONS)
+@njit(forceinline=True, **_OPTIONS)
 def _solve(matrix: Array, right: Array, solution: Array, inverse: Array) -> bool:
     """Solve by Cholesky with unit diagonal; also the inverse. False where singular."""
     n = len(right)

@@ -60,7 +60,9 @@ MOST_WINDOWS, MOST_OFF_CENTRE = 6, 1.0  # times a window is placed; px from part
 Array: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.generic]
 
-# Sums may be reordered (vectors); only where no NaN or infinity can come may the compiler exclude them.
+# Sums may be reordered (vectors). What is called so from compiled code must be inlined: a process that compiles
+# it calls another copy than one that loads it from the cache, and the last digits would differ.
+# Only where no NaN or infinity can come may the compiler exclude them.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _FAST_FINITE = _FAST | {"nnan"}
 _OPTIONS: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy"}
@@ -112,7 +114,7 @@ def _to_theta(parameters: Array, column: int, row: int, theta: Array) -> None:
 # Passes over the pixels ------------------------------------------------------------------------------
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _central_row(theta: Array, side: int, columns: Array) -> float:
     """E in the central row, and its ratios to the rows below and above, into ``columns``.
 
@@ -189,7 +191,7 @@ def _weigh(kind: int, shape: Any, field: Array, k: int, amplitude: float, backgr
     return weight * r / where_positive(shape - LEAST_SHAPE, shape, splat(LEAST_SHAPE)), splat(0.0), splat(0.0)
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _evaluate(kind: int, theta: Array, side: int, field: Array, columns: Array) -> float:
     """The objective; and in ``columns``, for each column, sums over its rows of
 
@@ -247,7 +249,7 @@ def _evaluate(kind: int, theta: Array, side: int, field: Array, columns: Array) 
     return total(objective)
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _sum(columns: Array, which: int, power: int) -> float:
     """One of the sums of ``_evaluate`` times a power of u, over the columns."""
     result = splat(0.0)
@@ -291,7 +293,7 @@ def _gradient(columns: Array, gradient: Array) -> None:
     gradient[6] = _sum(columns, 12, 0)
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _fix_weights(relative: bool, kappa: float, theta: Array, side: int, field: Array, columns: Array) -> None:
     """Weights: valid / (E + kappa), else valid / (variance of the model and the read noise)."""
     stride, half = columns.shape[1], side // 2
@@ -314,7 +316,7 @@ def _fix_weights(relative: bool, kappa: float, theta: Array, side: int, field: A
 # Windows ---------------------------------------------------------------------------------------------
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _read_window(
     image: Image,
     column: int,
@@ -363,7 +365,7 @@ def _read_window(
     return cut, most
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _soften(x: float, y: float, side: int, columns: Array) -> None:
     """Cut what counts to the square of side ``window - 1`` about (x, y), edge pixels by what is inside.
 
@@ -376,7 +378,7 @@ def _soften(x: float, y: float, side: int, columns: Array) -> None:
         columns[PART + 1, j] *= min(max(half + 0.5 - abs(j - half - y), 0.0), 1.0)
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _cover(side: int, field: Array, columns: Array) -> float:
     """How much of each pixel counts, from its factors; returns the sum."""
     stride = columns.shape[1]
@@ -391,7 +393,7 @@ def _cover(side: int, field: Array, columns: Array) -> float:
     return high * total(wide)
 
 
-@njit(fastmath=_FAST_FINITE, **_OPTIONS)
+@njit(fastmath=_FAST_FINITE, forceinline=True, **_OPTIONS)
 def _start(window: int, stride: int, field: Array, theta: Array) -> bool:
     """First parameters from the window alone: border, peak, and moments above 30 % of it.
 
@@ -813,7 +815,7 @@ def fit_windows(
         parameters[n, 5] = math.tanh(theta[5])
 
 
-@njit(fastmath=_FAST, **_OPTIONS)
+@njit(fastmath=_FAST, forceinline=True, **_OPTIONS)
 def _residual_sums(
     theta: Array, width: float, side: int, field: Array, columns: Array, envelope: Array
 ) -> None:

@@ -153,7 +153,7 @@ def _solve_spd(matrix, right):  # type: ignore[no-untyped-def]
     return x * scale, True
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"reassoc", "contract"})
 def _marginalise(moved, field, weight, residual, measured_covariance):  # type: ignore[no-untyped-def]
     """One linear step in the field error's coefficients (k, unit prior) and the pose (6), in this order.
 

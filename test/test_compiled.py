@@ -1,4 +1,4 @@
-"""Compiled code gives the same digits in the process that compiled it as in one that loads it from the cache."""
+"""Compiled code gives the same digits where it was compiled as where it is loaded from the cache."""
 
 from __future__ import annotations
 

@@ -60,8 +60,8 @@ MOST_WINDOWS, MOST_OFF_CENTRE = 6, 1.0  # times a window is placed; px from part
 Array: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.generic]
 
-# Sums may be reordered (vectors). What is called so from compiled code must be inlined: a process that compiles
-# it calls another copy than one that loads it from the cache, and the last digits would differ.
+# Sums may be reordered (vectors). What is called so from compiled code must be inlined: a process that
+# compiles it calls another copy than one that loads it from the cache, and the last digits would differ.
 # Only where no NaN or infinity can come may the compiler exclude them.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _FAST_FINITE = _FAST | {"nnan"}

@@ -102,9 +102,11 @@ class BagWriter:
         self._latched: dict[Channel, deque[_Message]] = {}
         self._written: dict[Channel, int] = {}
         self._attachments: dict[str, tuple[bytes, str]] = {}
-        self._files: list[_File] = []
+        #: Of the files before the last: a writer holds the index of all that it has written.
+        self._completed: list[FileSummary] = []
         self._ended = False
-        self._open_file()
+        self._file = self._new_file(0)
+        self._write_metadata()
 
     def __enter__(self) -> BagWriter:
         return self
@@ -122,8 +124,8 @@ class BagWriter:
             self._written[channel] = 0
             if depths := [q.depth for q in channel.qos if q.durability == "transient_local"]:
                 self._latched[channel] = deque(maxlen=max(depths))
-            if not self._files[-1].closed:
-                self._files[-1].add_channel(channel)
+            if not self._file.closed:
+                self._file.add_channel(channel)
         return channel
 
     def write(
@@ -137,9 +139,9 @@ class BagWriter:
         """Append one CDR message: received at ``log_time_ns``, sent at ``publish_time_ns``."""
         message = _Message(bytes(data), log_time_ns, publish_time_ns or log_time_ns, sequence)
         with self._saving_what_is_whole():
-            if self._files[-1].closed:
-                self._open_file(log_time_ns)
-            self._files[-1].write(channel, message)
+            if self._file.closed:
+                self._begin_next_file(log_time_ns)
+            self._file.write(channel, message)
         self._written[channel] += 1
         if channel in self._latched:
             self._latched[channel].append(message)
@@ -153,13 +155,13 @@ class BagWriter:
         """Attach a file's content, for instance the calibration, to this and all later files; another of
         the same ``name`` replaces it in those."""
         self._attachments[name] = data, media_type
-        if not self._files[-1].closed:
+        if not self._file.closed:
             with self._saving_what_is_whole():
-                self._files[-1].attach(name, data, media_type)
+                self._file.attach(name, data, media_type)
 
     def flush(self) -> None:
         """Hand everything to the operating system, and to the disk once per ``sync_period``."""
-        file = self._files[-1]
+        file = self._file
         if file.closed:
             return
         with self._saving_what_is_whole():
@@ -175,18 +177,17 @@ class BagWriter:
 
     def split(self) -> None:
         """Complete the current file; the next message opens another. Nothing where it holds no message."""
-        file = self._files[-1]
-        if file.message_count and not file.closed:
+        if self._file.message_count and not self._file.closed:
             with self._saving_what_is_whole():
-                file.close()
+                self._file.close()
                 self._write_metadata()
 
     def close(self) -> None:
         """Complete the files and the metadata; harmless when repeated."""
         self._ended = True
-        if not self._files[-1].closed:
+        if not self._file.closed:
             with self._saving_what_is_whole():
-                self._files[-1].close()
+                self._file.close()
                 self._write_metadata()
 
     @property
@@ -197,14 +198,17 @@ class BagWriter:
     @property
     def file(self) -> Path:
         """The last file."""
-        return self._files[-1].path
+        return self._file.path
 
-    def _open_file(self, log_time_ns: int = 0) -> None:
+    def _new_file(self, number: int) -> _File:
+        return _File(self.path / f"{self.path.name}_{number}.mcap", self._compression, self.provenance)
+
+    def _begin_next_file(self, log_time_ns: int) -> None:
         if self._ended:
             raise ValueError(f"{self.path} is closed")
-        path = self.path / f"{self.path.name}_{len(self._files)}.mcap"
-        file = _File(path, self._compression, self.provenance)
-        self._files.append(file)
+        file = self._new_file(len(self._completed) + 1)
+        self._completed.append(self._file.summary())
+        self._file = file
         for channel in self._written:
             file.add_channel(channel)
         for name, (data, media_type) in self._attachments.items():
@@ -220,16 +224,14 @@ class BagWriter:
             yield
         except OSError:
             self._ended = True
-            self._files[-1].abandon()
+            self._file.abandon()
             # The others are complete; reading them again would take as long as they are large.
             with suppress(OSError, InputError):
-                last = complete_file(self._files[-1].path).summary
-                self._write_metadata(last)
+                self._write_metadata(complete_file(self._file.path).summary)
             raise
 
     def _write_metadata(self, last: FileSummary | None = None) -> None:
-        files = [file.summary() for file in self._files]
-        write_metadata(self.path, [*files[:-1], last or files[-1]], self.provenance)
+        write_metadata(self.path, [*self._completed, last or self._file.summary()], self.provenance)
 
 
 class _Message(NamedTuple):

@@ -86,7 +86,8 @@ class _Contents:
 def mcap_files(path: Path) -> list[Path]:
     """The .mcap files of a bag in their order, or ``path`` itself where it is one."""
     if path.is_dir():
-        return sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
+        files = (file for file in path.glob("*.mcap") if file.is_file())
+        return sorted(files, key=lambda file: (len(file.name), file.name))
     return [path] if path.suffix == ".mcap" else []
 
 
@@ -96,11 +97,15 @@ def interrupted(path: Path) -> bool:
 
 
 def lacks_end(file: Path) -> bool:
-    """Was it begun as an .mcap file, but never completed?"""
-    with file.open("rb") as stream:
-        begun = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
-        stream.seek(-min(file.stat().st_size, len(MCAP0_MAGIC)), os.SEEK_END)
-        return begun and not (file.stat().st_size > 2 * len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC)
+    """Was it begun as an .mcap file, but never completed? False where it cannot be read."""
+    try:
+        with file.open("rb") as stream:
+            begun = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+            size = stream.seek(0, os.SEEK_END)
+            stream.seek(max(size - len(MCAP0_MAGIC), 0))
+            return begun and not (size > 2 * len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC)
+    except OSError:
+        return False
 
 
 def recover(path: Path) -> list[Recovered]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
@@ -185,6 +187,23 @@ def test_files_are_split_between_cycles_and_read_as_one(tmp_path):
                 assert file == files[-1] or 20_000 <= file.stat().st_size < 32_000
             counters += infos
         assert counters == list(range(31))
+
+
+def test_a_completed_file_leaves_no_index_in_memory(tmp_path):
+    """An index is a kilobyte per cycle: without end in a night."""
+
+    def indexes() -> int:
+        gc.collect()
+        return sum(isinstance(thing, ChunkIndex) for thing in gc.get_objects())
+
+    before = indexes()
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(40):
+            bag.write_message("/frame_info", messages.frame_info(frame(k)), k)
+            bag.flush()
+            if k % 10 == 9:
+                bag.split()
+        assert indexes() - before == 10  # of the last file
 
 
 def test_an_exception_while_writing_loses_nothing(tmp_path):

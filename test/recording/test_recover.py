@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording import messages
 from mems6dof_ros.recording.bag import BagReader, BagWriter, Qos
-from mems6dof_ros.recording.recover import recover
+from mems6dof_ros.recording.recover import interrupted, recover
 
 T0 = 1_700_000_000_000_000_000
 
@@ -142,6 +142,16 @@ def test_other_files_are_refused_and_left_alone(tmp_path):
     (tmp_path / "zero.mcap").touch()
     with pytest.raises(InputError, match="an empty file"):
         recover(tmp_path / "zero.mcap")
+
+
+def test_a_directory_named_like_a_file_is_none(bag):
+    (bag / "bag_0.mcap").unlink()
+    (bag / "bag_0.mcap").mkdir()
+    with pytest.raises(InputError, match="Is a directory"):
+        BagReader(bag)
+    with pytest.raises(InputError, match=r"no \.mcap file"):
+        recover(bag)
+    assert not interrupted(bag)
 
 
 def test_damage_in_the_middle_costs_that_chunk_only(bag):

@@ -158,6 +158,10 @@ def _open_tiff(path: Path) -> tuple[int, Callable[[int], Pixels], float, float]:
 
     def load(k: int) -> Pixels:
         try:
+            page, needed = series.pages[k], math.prod(series.keyframe.chunked)
+            pieces = min(len(page.dataoffsets), len(page.databytecounts)) if page else 0
+            if pieces != needed:  # tifffile fills in zeros
+                raise ValueError(f"{pieces} of its {needed} strips or tiles")
             return series.asarray(key=k)
         except Exception as error:
             # Without its optional codecs tifffile knows no LZW, which OpenCV does.

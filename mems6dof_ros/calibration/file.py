@@ -212,7 +212,7 @@ def load_calibration(path: str | Path, method: str | None = None) -> Calibration
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(where, "no calibration", f"a file with 'format: {FORMAT}'")
     version = document.get("version")
-    if version not in _READERS:
+    if not isinstance(version, int) or version not in _READERS:
         raise InputError(f"{where}: version", repr(version), f"one of {', '.join(map(str, _READERS))}")
     calibration = _READERS[version](_Fields(document, where))
     stated = document.get("calibration_id")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import threading
 from collections import Counter
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from mems6dof_ros.analysis.check import check_bag
+from mems6dof_ros.calibration.file import load_calibration
+from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.recording.validation import bags, fuzzing
 from mems6dof_ros.recording.validation.mutation import BYTE_FAULTS, contradicted, to_yaml
@@ -36,6 +39,15 @@ def test_damaged_files_end_in_one_line_or_in_a_part(originals, tmp_path, kind, c
     assert outcomes["refused"] + outcomes["part"] >= count // 4  # the faults are faults
     assert max(answer.memory for answer in answers) < fuzzing.MEMORY_LIMIT
     assert max(answer.seconds for answer in answers) < fuzzing.TIME_LIMIT
+
+
+@pytest.mark.parametrize("version", ["[1]", "{}", "1.5", "text", "99"])
+def test_a_calibration_of_an_impossible_version_is_refused(originals, tmp_path, version):
+    text = (originals / "calibration" / "optics.yaml").read_text()
+    path = tmp_path / "optics.yaml"
+    path.write_text(re.sub(r"^version: .*", f"version: {version}", text, flags=re.MULTILINE))
+    with pytest.raises(InputError, match="version"):
+        load_calibration(path)
 
 
 def test_the_originals_are_good(originals):

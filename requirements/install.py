@@ -19,6 +19,8 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 LOCKS = [ROOT / "requirements" / f"{name}.txt" for name in ("runtime", "ros", "dev")]
 PACKAGE = "mems6dof_ros"
+# Folder of share/mems6dof_ros to that of the checkout, as in setup.py.
+SHARED = {"launch": "launch_scripts", "config": "config", "bags": "bags"}
 # What a sourced ROS or another activated wheel environment would push into ours.
 FOREIGN = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "PYTHONHOME")
 
@@ -29,7 +31,8 @@ def main() -> None:
     step("environment", environment, install_requirements)
     step("messages", digest(files("mems6dof_msgs"), environment), build_messages)
     described = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml")]
-    step("package", digest(described, environment, str(ROOT)), install_package)
+    shared = sorted(str(path) for folder in SHARED.values() for path in files(folder))
+    step("package", digest(described, environment, str(ROOT), *shared), install_package)
 
 
 def refuse_sourced_ros() -> None:
@@ -104,9 +107,11 @@ def install_package() -> None:
     # launch and the ament index look in lib/<package>/ and share/.
     share = VENV / "share"
     link(share / "ament_index" / "resource_index" / "packages" / PACKAGE, ROOT / "resource" / PACKAGE)
+    shutil.rmtree(share / PACKAGE, ignore_errors=True)
     link(share / PACKAGE / "package.xml", ROOT / "package.xml")
-    for name, folder in (("launch", "launch_scripts"), ("config", "config"), ("bags", "bags")):
-        link(share / PACKAGE / name, ROOT / folder)
+    for name, folder in SHARED.items():
+        for path in files(folder):  # file by file: ros2 launch does not look into linked folders
+            link(share / PACKAGE / name / path.relative_to(ROOT / folder), path)
     for name in re.findall(r'"(\w+) = mems6dof_ros\.nodes\.', (ROOT / "setup.py").read_text()):
         link(VENV / "lib" / PACKAGE / name, VENV / "bin" / name)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import subprocess
@@ -100,6 +101,22 @@ def test_the_installed_nodes_run(install: Path, tmp_path: Path) -> None:
     command = f". {install / 'setup.sh'} && exec {sys.executable} -c '{where}'"
     result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, cwd=tmp_path, timeout=60)
     assert all(path.startswith(str(install)) for path in result.stdout.split()), result
+
+
+def test_make_installs_where_ros2_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`ros2 launch` walks through share/<package> and does not follow linked folders."""
+    monkeypatch.syspath_prepend(str(ROOT / "requirements"))
+    install = importlib.import_module("install")
+    monkeypatch.setattr(install, "VENV", tmp_path)
+    monkeypatch.setattr(install, "run", lambda *command: None)
+    install.install_package()
+    install.install_package()  # again, as after a change of setup.py
+    share = tmp_path / "share" / "mems6dof_ros"
+    walked = [Path(folder, name) for folder, _, names in os.walk(share) for name in names]
+    found = {path.name for path in walked if path.is_file()}
+    assert {f"{name}.launch.py" for name in SYSTEMS} < found
+    assert {"package.xml", "localizer.yaml", "sample_0.mcap"} < found
+    assert {path.name for path in (tmp_path / "lib" / "mems6dof_ros").iterdir()} == NODES
 
 
 @pytest.mark.parametrize(

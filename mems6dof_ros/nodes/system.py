@@ -158,9 +158,9 @@ def commanded(**settings: Any) -> NodeSpec:
     )
 
 
-def replayed(bag: str, topic: str = "") -> NodeSpec:
-    """A frame_source that replays a bag and ends when all of it has become poses."""
-    return _finite("bag", {"bag.path": bag, "bag.topic": topic})
+def replayed(bag: str, topic: str = "", **parameters: Any) -> NodeSpec:
+    """A frame_source that replays a bag and ends when all of it has become poses; further ``parameters``."""
+    return _finite("bag", {"bag.path": bag, "bag.topic": topic, **parameters})
 
 
 def _finite(kind: str, options: Mapping[str, Any]) -> NodeSpec:
@@ -200,7 +200,7 @@ def _subscriptions(node: NodeSpec) -> Sequence[str]:
 def _live(values: Mapping[str, str]) -> list[NodeSpec]:
     source = None
     if values["source"] != "none":
-        parameters = {"source": values["source"], "pacing": "rate", "rate": float(values["rate"])}
+        parameters = {"source": values["source"], "pacing": "rate", "rate": _number(values, "rate")}
         source = NodeSpec("frame_source", parameters)
     image_topic = values["image_topic"]
     nodes = chain(source, queue_policy="drop_oldest", image_topic=image_topic, **_common(values))
@@ -208,26 +208,27 @@ def _live(values: Mapping[str, str]) -> list[NodeSpec]:
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
-    source = replayed(values["bag"], values["topic"])
-    return chain(source, **_common(values))
+    # What is not told is left to the parameter files.
+    told = {name: kind(values, name) for name, kind in _REPLAYING.items() if values[name]}
+    return chain(replayed(values["bag"], values["topic"], **told), **_common(values))
 
 
 def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
-    size = int(values["size"])
+    size = _whole(values, "size")
     source = simulated(
-        int(values["cycles"]),
+        _whole(values, "cycles"),
         width_px=size,
         height_px=size,
-        seed=int(values["seed"]),
-        optics_seed=int(values["optics_seed"]),
+        seed=_whole(values, "seed"),
+        optics_seed=_whole(values, "optics_seed"),
     )
     return chain(source, **_common(values))
 
 
 def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
-    size = int(values["size"])
+    size = _whole(values, "size")
     source = commanded(
-        width_px=size, height_px=size, seed=int(values["seed"]), optics_seed=int(values["optics_seed"])
+        width_px=size, height_px=size, seed=_whole(values, "seed"), optics_seed=_whole(values, "optics_seed")
     )
     controller = NodeSpec("controller", {"law": values["law"]})
     return _respawning(chain(source, controller=controller, **_common(values)), values)
@@ -239,17 +240,17 @@ def _calibrate(values: Mapping[str, str]) -> list[NodeSpec]:
     calibrator = NodeSpec("calibrator", remappings=remap)
     if values["source"] == "none":
         return [calibrator]
-    camera = {"source": values["source"], "pacing": "rate", "rate": float(values["rate"])}
+    camera = {"source": values["source"], "pacing": "rate", "rate": _number(values, "rate")}
     if values["source"] != "simulator":
         return [NodeSpec("frame_source", camera), calibrator]
-    size = int(values["size"])
+    size = _whole(values, "size")
     simulated_substrate = {
         "simulator.substrate": True,
         "simulator.substrate_beads": max(200 * size**2 // 2048**2, 12),
         "simulator.width_px": size,
         "simulator.height_px": size,
-        "simulator.seed": int(values["seed"]),
-        "simulator.optics_seed": int(values["optics_seed"]),
+        "simulator.seed": _whole(values, "seed"),
+        "simulator.optics_seed": _whole(values, "optics_seed"),
     }
     simulation = SimulationSettings()
     noise = json.loads(camera_to_json(camera_noise(simulation)))
@@ -278,12 +279,33 @@ def _respawning(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSp
     return [replace(node, respawn=respawn) for node in nodes]
 
 
+def _number(values: Mapping[str, str], name: str) -> float:
+    try:
+        return float(values[name])
+    except ValueError:
+        raise InputError(f"argument {name}", f"'{values[name]}'", "a number") from None
+
+
+def _whole(values: Mapping[str, str], name: str) -> int:
+    try:
+        return int(values[name])
+    except ValueError:
+        raise InputError(f"argument {name}", f"'{values[name]}'", "a whole number") from None
+
+
 def _truth(values: Mapping[str, str], name: str) -> bool:
     if values[name] not in ("true", "false"):
         raise InputError(f"argument {name}", f"'{values[name]}'", "true or false")
     return values[name] == "true"
 
 
+_REPLAYING: Mapping[str, Callable[[Mapping[str, str], str], float]] = {
+    "speed": _number,
+    "begin": _number,
+    "loop": _truth,
+    "start_paused": _truth,
+    "publish_clock": _truth,
+}
 _CALIBRATION = {
     "calibration": ("", "Calibration file; empty: x and y only"),
     "bodies": ("", "File of several rigid bodies in view (docs/files.md); empty: one"),
@@ -323,10 +345,15 @@ SYSTEMS = {
         _live,
     ),
     "replay": System(
-        "A bag as fast as the nodes take it, nothing lost.",
+        "A bag, nothing lost.",
         {
             "bag": ("", "Directory of a rosbag2 bag, or an .mcap file"),
             "topic": ("", "Topic of its images; empty: the only one, or the only one named image_raw"),
+            "speed": ("", "At most so many times as fast as recorded; empty: as fast as the nodes take it"),
+            "begin": ("", "Seconds of the recording to leave out at its beginning"),
+            "loop": ("", "true: begin again at the end, with stamps that follow"),
+            "start_paused": ("", "true: wait for frame_source/start, or /step for a frame each"),
+            "publish_clock": ("", "true: publish /clock, for nodes with use_sim_time"),
             **_CALIBRATION,
             **_OUTPUT,
             **_ARRANGEMENT,

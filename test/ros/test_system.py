@@ -225,6 +225,29 @@ def test_tables_are_complete(name: str) -> None:
         system.table({"bagg": "x"})
 
 
+def test_a_replay_is_told_how() -> None:
+    values = {"bag": "b", "speed": "2", "begin": "1.5", "loop": "true", "publish_clock": "true"}
+    source = SYSTEMS["replay"].table(values)[0].parameters
+    assert {"speed": 2.0, "begin": 1.5, "loop": True, "publish_clock": True}.items() <= source.items()
+    assert "start_paused" not in source  # left to a parameter file
+    assert source["pacing"] == "consumer"  # nothing is lost, however fast
+
+
+@pytest.mark.parametrize(
+    ("system", "argument", "value", "expected"),
+    [
+        ("replay", "speed", "fast", "a number"),
+        ("replay", "loop", "yes", "true or false"),
+        ("demo", "size", "2048.0", "a whole number"),
+        ("live", "rate", "", "a number"),
+        ("calibrate", "seed", "x", "a whole number"),
+    ],
+)
+def test_a_wrong_argument_is_one_clear_error(system: str, argument: str, value: str, expected: str) -> None:
+    with pytest.raises(InputError, match=rf"argument {argument}: found '{value}'; expected {expected}"):
+        SYSTEMS[system].table({argument: value})
+
+
 def test_a_camera_driver_of_somebody_else() -> None:
     table = SYSTEMS["live"].table({"source": "none", "image_topic": "/camera/image", "calibration": "c.yaml"})
     assert [node.executable for node in table] == ["localizer", "pose_estimator"]

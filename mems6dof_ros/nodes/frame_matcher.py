@@ -44,6 +44,10 @@ class FrameMatcher:
         """An image has arrived at ``arrival_ns``."""
         self._waiting.append((stamp_ns, self._ticks, ArrivedFrame(image, None, arrival_ns)))
 
+    def has_image(self, stamp_ns: int) -> bool:
+        """An image of that stamp waits."""
+        return any(stamp_ns == waiting for waiting, _, _ in self._waiting)
+
     @property
     def informed(self) -> bool:
         """True once an info has come."""

@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
@@ -42,6 +43,7 @@ from mems6dof_ros.nodes.camera import adjust_camera, camera_parameters, serve_ca
 from mems6dof_ros.nodes.common import WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter, of_settings
 from mems6dof_ros.nodes.schedule import Schedule
+from mems6dof_ros.nodes.shared_frames import FrameRing, ring_path
 from mems6dof_ros.nodes.stage import serve_stage
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.settings import SimulationSettings
@@ -117,6 +119,11 @@ PARAMETERS = (
         "Time after which a frame that nobody acknowledged counts as lost and the next one is published.",
         "s",
         (0.1, 3600.0),
+    ),
+    Parameter(
+        "share_frames",
+        True,
+        "Frames also go by memory that is shared with a localizer on this host, which then leaves the topic.",
     ),
     START_PAUSED,
     Parameter(
@@ -199,6 +206,7 @@ class FrameSourceNode(InstrumentNode):
         self._in_flight: dict[int, float] = {}  # stamp in ns: when published, monotonic s
         self._schedule = Schedule()
         self._source: FrameSource | None = None
+        self._ring: FrameRing | None = None
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_service(Trigger, "~/step", self._on_step)
@@ -225,8 +233,20 @@ class FrameSourceNode(InstrumentNode):
             topics.CAMERA_INFO: self.create_publisher(CameraInfo, topics.CAMERA_INFO, transport.MESSAGES),
             topics.TRUTH: self.create_publisher(GroundTruth, topics.TRUTH, transport.MESSAGES),
         }
+        self._ring = self._make_ring() if self.values.get("share_frames") else None
         wanted = self.values["publish_clock"]
         self._clocks = self.create_publisher(Clock, "/clock", transport.MESSAGES) if wanted else None
+
+    def _make_ring(self) -> FrameRing | None:
+        """None where there is no room for it, which costs time but loses nothing."""
+        info = self._frames.info
+        size = info.width * info.height * np.dtype(messages.PIXEL_TYPES[info.encoding]).itemsize
+        topic = self._topics[topics.FRAME_INFO].topic_name
+        try:
+            return FrameRing(ring_path(topic, self.context.get_domain_id()), size)
+        except OSError as error:
+            self.get_logger().info(f"frames go by the topic alone: {error}")
+            return None
 
     def activate(self) -> None:
         if self.values["pacing"] == "consumer":
@@ -264,6 +284,9 @@ class FrameSourceNode(InstrumentNode):
 
     def cleanup(self) -> None:
         self._frames.stop()
+        if self._ring:
+            self._ring.close()
+        self._ring = None
         self._source = None
         self.get_logger().info(
             f"{self.health.total('frames')} frames published, {self.health.total('refused')} refused,"
@@ -355,6 +378,8 @@ class FrameSourceNode(InstrumentNode):
             for message in several(frame)
         ]
         frame = replace(frame, published_ns=published_ns or time.time_ns())
+        if self._ring and self._ring.wanted:
+            self._ring.write(frame)
         self._topics[topics.FRAME_INFO].publish(messages.to_rclpy(messages.frame_info(frame)))
         for publisher, message in made:
             publisher.publish(message)

@@ -3,7 +3,8 @@
 Subscribes to ``image_raw`` and, where somebody publishes it, ``frame_info``; publishes ``localizations``,
 and ``localizations/points`` (sensor_msgs/PointCloud2) while somebody listens. Every frame gives one
 message: an empty one where the frame cannot be used, so that nobody waits for it in vain. With
-``tracking.enabled`` it subscribes to ``pose_6dof`` too.
+``tracking.enabled`` it subscribes to ``pose_6dof`` too. While ``frame_source`` shares its frames in memory
+(``nodes.shared_frames``), it does not subscribe to the images.
 """
 
 from __future__ import annotations
@@ -38,11 +39,16 @@ from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, Instrume
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
 from mems6dof_ros.nodes.frame_order import Arrival, FrameOrder
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
+from mems6dof_ros.nodes.shared_frames import SharedFrames, SharedImage, ring_path
 from mems6dof_ros.nodes.sim_time import on_jump_back
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
 
 POINTS = "localizations/points"
+
+#: Shared frames in a row, each within so many seconds of the one before, upon which the topic is left; and
+#: without an info for that time it is subscribed to again, since somebody else may publish there.
+_SHARED_IN_A_ROW, _SOON = 3, 1.0
 
 _DETECTION = {
     "binning": ("px", "Side of one cell of the image that detection works on."),
@@ -173,16 +179,47 @@ class LocalizerNode(InstrumentNode):
         if self._output.tracker:
             stream.subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
         stream.subscribe(FrameInfo, topics.FRAME_INFO, self._on_info)
-        stream.subscribe(Image, topics.IMAGE, self._on_image, transport.FRAMES, raw=True)
+        self._subscribe_to_images()
+        info_topic = self.resolve_topic_name(topics.FRAME_INFO)
+        self._shared = SharedFrames(ring_path(info_topic, self.context.get_domain_id()))
+        self._shared_stamps: deque[int] = deque(maxlen=64)
+        self._in_a_row, self._informed_at = 0, -math.inf
+        self.health.gauge("images by", lambda: "topic" if self._by_topic else "shared memory")
         stream.begin()
         self.tell("ready")
 
+    def _subscribe_to_images(self) -> None:
+        assert self.stream is not None
+        self.stream.subscribe(Image, topics.IMAGE, self._on_image, transport.FRAMES, raw=True)
+        self._by_topic = True
+
     def _on_info(self, info: FrameInfo) -> None:
-        self._matcher.add_info(messages.nanoseconds(info.header.stamp), info)
+        stamp_ns = messages.nanoseconds(info.header.stamp)
+        self._matcher.add_info(stamp_ns, info)
+        image = self._shared.find(info.header, stamp_ns)
+        if image and not self._matcher.has_image(stamp_ns):
+            self._matcher.add_image(stamp_ns, image, time.time_ns())
+            self._shared_stamps.append(stamp_ns)
+        self._choose(image is not None)
         self._forward()
+
+    def _choose(self, shared: bool) -> None:
+        """Subscribe to the images, or no more, upon an info whose frame was ``shared`` or not."""
+        assert self.stream is not None
+        soon = time.monotonic() - self._informed_at < _SOON
+        self._informed_at = time.monotonic()
+        self._in_a_row = self._in_a_row + 1 if shared and soon else 0
+        if self._by_topic and self._in_a_row >= _SHARED_IN_A_ROW:
+            self.stream.unsubscribe(topics.IMAGE)
+            self._by_topic = False
+        elif not self._by_topic and not shared:
+            self._subscribe_to_images()
 
     def _on_image(self, data: bytes) -> None:
         arrival_ns = time.time_ns()
+        with contextlib.suppress(InputError):
+            if transport.stamp_of(data) in self._shared_stamps:
+                return
         try:
             image = messages.deserialize(data, "sensor_msgs/msg/Image")  # its pixels stay where they are
         except Exception as error:  # whatever a reader of nonsense stumbles over
@@ -196,6 +233,9 @@ class LocalizerNode(InstrumentNode):
 
     def _on_tick(self) -> None:
         self._matcher.tick()
+        self._shared.attend()
+        if not self._by_topic and time.monotonic() - self._informed_at > _SOON:
+            self._subscribe_to_images()
         self._forward()
 
     def _on_jump_back(self, seconds: float) -> None:
@@ -233,6 +273,9 @@ class LocalizerNode(InstrumentNode):
                 found = self._output.localize(replace(frame, frame_counter=counter, cycle=cycle))
             except InputError as error:
                 self.health.refused(str(error))
+        if isinstance(arrived.image, SharedImage) and not arrived.image.intact():
+            self.health.lost(1, f"frame {counter} was overwritten while it waited or was localized")
+            found = None
         if found is None:
             header = arrived.image.header
             published_ns = messages.nanoseconds(arrived.info.publication_time) if arrived.info else 0

@@ -31,7 +31,8 @@ class OutOfExecutor(CallbackGroup):
 
 
 class Stream:
-    """Waits for a few topics only and calls back in its own thread; ``subscribe``, ``begin``, ``end``.
+    """Waits for a few topics only and calls back in its own thread; ``subscribe``, ``begin``, ``end``. What
+    is called back may ``subscribe`` and ``unsubscribe`` too.
 
     An executor of rclpy builds its list of all that a node has (parameter and lifecycle services, timers)
     anew each time it waits, which takes half a millisecond of Python. A callback may block, as Worker.put
@@ -50,6 +51,7 @@ class Stream:
         self._node, self._failed, self._tick, self._period = node, failed, tick, period
         self._group = OutOfExecutor()
         self._subscriptions: list[tuple[Any, Callable[[Any], None]]] = []
+        self._changed = False
         self._wake = GuardCondition(None, None, context=node.context)
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="stream", daemon=True)
@@ -62,12 +64,21 @@ class Stream:
         quality: QoSProfile = transport.MESSAGES,
         raw: bool = False,
     ) -> None:
-        """Before ``begin``: call ``act`` with each message, ``raw``: serialized. Of what has arrived
-        together, the topic that was subscribed to first comes first. The node destroys the subscription."""
+        """Call ``act`` with each message, ``raw``: serialized. Of what has arrived together, the topic that
+        was subscribed to first comes first. The node destroys the subscription."""
         subscription = self._node.create_subscription(
             kind, topic, act, quality, callback_group=self._group, raw=raw
         )
         self._subscriptions.append((subscription, subscription.callback))  # refuses what act refuses
+        self._changed = True
+
+    def unsubscribe(self, topic: str) -> None:
+        """Take no more messages of ``topic``."""
+        name = self._node.resolve_topic_name(topic)
+        for each in [each for each in self._subscriptions if each[0].topic_name == name]:
+            self._subscriptions.remove(each)
+            self._node.destroy_subscription(each[0])
+        self._changed = True
 
     def begin(self) -> None:
         """Take messages from now on."""
@@ -85,31 +96,39 @@ class Stream:
             self._thread.join()
 
     def _run(self) -> None:
+        self._ticked = time.monotonic()
         try:
-            with ExitStack() as held:
-                handles = [subscription.handle for subscription, _ in self._subscriptions]
-                guard, context = self._wake.handle, self._node.context.handle
-                for handle in (*handles, guard, context):
-                    held.enter_context(handle)
-                waiting = _rclpy.WaitSet(len(handles), 1, 0, 0, 0, 0, context)
-                ticked = time.monotonic()
-                while not self._ending and self._node.context.ok():
-                    waiting.clear_entities()
-                    for handle in handles:
-                        waiting.add_subscription(handle)
-                    waiting.add_guard_condition(guard)
-                    waiting.wait(max(int((ticked + self._period - time.monotonic()) * 1e9), 0))
-                    self._take()
-                    if time.monotonic() - ticked >= self._period:
-                        self._tick()
-                        ticked = time.monotonic()
+            while not self._ending and self._node.context.ok():
+                self._wait_for(self._subscriptions)
         except BaseException as error:  # handed to the main thread, which ends the node
             self._failed(error)
 
-    def _take(self) -> None:
-        for subscription, act in self._subscriptions:
+    def _wait_for(self, subscriptions: list[tuple[Any, Callable[[Any], None]]]) -> None:
+        """Take what comes, until there is something else to wait for."""
+        self._changed = False
+        with ExitStack() as held:
+            handles = [subscription.handle for subscription, _ in subscriptions]
+            guard, context = self._wake.handle, self._node.context.handle
+            for handle in (*handles, guard, context):
+                held.enter_context(handle)
+            waiting = _rclpy.WaitSet(len(handles), 1, 0, 0, 0, 0, context)
+            while not self._changed and not self._ending and self._node.context.ok():
+                waiting.clear_entities()
+                for handle in handles:
+                    waiting.add_subscription(handle)
+                waiting.add_guard_condition(guard)
+                waiting.wait(max(int((self._ticked + self._period - time.monotonic()) * 1e9), 0))
+                self._take(subscriptions)
+                if time.monotonic() - self._ticked >= self._period:
+                    self._tick()
+                    self._ticked = time.monotonic()
+
+    def _take(self, subscriptions: list[tuple[Any, Callable[[Any], None]]]) -> None:
+        for subscription, act in subscriptions:
             while not self._ending:
                 found = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if found is None:
                     break
                 act(found[0])
+                if self._changed:
+                    return

@@ -1,0 +1,210 @@
+"""Frames by the memory that a source and a localizer on one host share."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from peers import SMALL_GEAR, NodeProcess, Peer
+from sensor_msgs.msg import Image
+
+from mems6dof_msgs.msg import Localizations
+from mems6dof_ros.frame import Frame
+from mems6dof_ros.nodes.shared_frames import SLOTS, FrameRing, SharedFrames, ring_path
+from mems6dof_ros.nodes.shared_memory import FOLDER, remove_abandoned
+from mems6dof_ros.recording import messages
+from mems6dof_ros.simulation.experiment import motion_frames
+from mems6dof_ros.simulation.settings import SimulationSettings
+
+Start = Callable[..., NodeProcess]
+
+RNG = np.random.default_rng(5)
+
+
+def frame(number: int, kind: type = np.uint16, size: tuple[int, int] = (48, 64)) -> Frame:
+    pixels = RNG.integers(0, np.iinfo(kind).max, size).astype(kind)
+    return Frame(pixels, stamp_ns=1000 + number, frame_counter=number, cycle=number)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return ring_path("/lab/frame_info", 7, tmp_path)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_frames_come_back_without_a_copy(path: Path, kind: type) -> None:
+    ring, reader = FrameRing(path, 48 * 64 * 2), SharedFrames(path)
+    assert not ring.wanted
+    reader.attend()
+    assert ring.wanted
+    written = [frame(number, kind) for number in range(SLOTS + 3)]
+    for one in written:
+        ring.write(one)
+    for one in written[3:]:
+        header = messages.to_rclpy(messages.header(one.stamp_ns, one.frame_id))
+        image = reader.find(header, one.stamp_ns)
+        assert image is not None
+        back = messages.to_frame(image)
+        assert back.image.dtype == kind
+        assert np.array_equal(back.image, one.image)
+        assert np.shares_memory(back.image, image.data)
+        assert (back.stamp_ns, back.frame_id) == (one.stamp_ns, one.frame_id)
+        with pytest.raises(ValueError, match="read-only"):
+            back.image[0, 0] = 1
+    assert reader.find(None, written[0].stamp_ns) is None  # its place is taken
+    assert reader.find(None, 0) is None  # no stamp tells nothing apart
+    ring.close()
+    assert not path.exists()
+
+
+def test_a_frame_that_is_overwritten_is_known(path: Path) -> None:
+    ring, reader = FrameRing(path, 48 * 64 * 2), SharedFrames(path)
+    reader.attend()
+    ring.write(frame(0))
+    image = reader.find(None, 1000)
+    for number in range(1, SLOTS):
+        ring.write(frame(number))
+    assert image is not None
+    assert image.intact()
+    ring.write(frame(SLOTS))
+    assert not image.intact()
+
+
+def test_of_two_frames_with_one_stamp_the_later_is_found(path: Path) -> None:
+    ring, reader = FrameRing(path, 48 * 64 * 2), SharedFrames(path)
+    reader.attend()
+    ring.write(frame(0))
+    again = frame(0)
+    ring.write(again)
+    image = reader.find(messages.to_rclpy(messages.header(1000, "")), 1000)
+    assert np.array_equal(messages.image_pixels(image), again.image)
+
+
+def test_a_frame_greater_than_was_said_stays_out(path: Path) -> None:
+    ring, reader = FrameRing(path, 48 * 64 * 2), SharedFrames(path)
+    reader.attend()
+    ring.write(frame(0, size=(480, 640)))
+    assert reader.find(None, 1000) is None
+
+
+def test_a_reader_follows_to_the_ring_of_a_later_source(path: Path) -> None:
+    reader = SharedFrames(path)
+    reader.attend()
+    assert reader.find(None, 1000) is None
+    first = FrameRing(path, 48 * 64)
+    reader.attend()
+    second = FrameRing(path, 48 * 64 * 2)  # in place of the first, which may have been killed
+    first.close()
+    assert path.exists()
+    assert not second.wanted
+    reader.attend()
+    second.write(frame(0))
+    assert reader.find(None, 1000) is not None
+    second.close()
+    reader.attend()
+    assert reader.find(None, 1000) is None
+
+
+def test_what_is_no_ring_is_left_alone(path: Path) -> None:
+    for content in (b"", b"\1" * 10_000):
+        path.write_bytes(content)
+        reader = SharedFrames(path)
+        reader.attend()
+        assert reader.find(None, 1000) is None
+        assert path.read_bytes() == content
+        path.unlink()
+
+
+def test_without_room_there_is_no_ring(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = os.statvfs_result((4096, 4096, 100, 20_000, 20_000, 0, 0, 0, 0, 255))  # 78 MiB free
+    monkeypatch.setattr(os, "statvfs", lambda _: few)
+    with pytest.raises(OSError, match="192 MiB for shared frames, 78 MiB free"):
+        FrameRing(path, 2048 * 2048 * 2)
+    assert not path.exists()
+
+
+def test_only_rings_of_dead_sources_are_removed(path: Path) -> None:
+    ring = FrameRing(path, 48 * 64)
+    os.utime(path, (time.time() - 60,) * 2)
+    assert remove_abandoned(path.parent) == 0
+    os.close(ring._file)  # with its memory, as the kernel does for a killed process
+    del ring
+    gc.collect()
+    assert remove_abandoned(path.parent) == SLOTS * 2 * 4096 + 4096
+    assert not path.exists()
+
+
+# Live -----------------------------------------------------------------------------------------------
+
+
+def by(peer: Peer, way: str) -> bool:
+    """The localizer says last that images come this ``way``."""
+    said = [
+        pair.value
+        for array in peer.received["/diagnostics"]
+        for status in array.status
+        for pair in status.values
+        if pair.key == "images by"
+    ]
+    return bool(said) and said[-1] == way
+
+
+def test_a_localizer_leaves_the_topic_and_comes_back(
+    start: Start, peer: Peer, domain: int, calibration: str
+) -> None:
+    peer.listen(Localizations, "localizations")
+    peer.listen(DiagnosticArray, "/diagnostics")
+    localizer = start("localizer", "-p", f"calibration:={calibration}")
+    localizer.wait_for_line("ready")
+    small = [word for name, value in SMALL_GEAR.items() for word in ("-p", f"simulator.{name}:={value}")]
+    arguments = ["-p", "rate:=40.0", "-p", "simulator.loop:=4", "-p", "simulator.frame_rate:=40.0"]
+    source = start("frame_source", *arguments, *small)
+    found: list[Any] = peer.received["localizations"]
+    peer.wait(lambda: by(peer, "shared memory"))
+    assert ring_path("/frame_info", domain, FOLDER).exists()
+    assert peer.node.count_subscribers("image_raw") == 0
+    here = len(found)
+    peer.wait(lambda: len(found) > here + 40)
+    counters = [message.frame_counter for message in found]
+    assert counters == list(range(counters[0], counters[0] + len(counters)))  # also over the change
+    assert min(len(message.x) for message in found) > 0.7 * max(len(message.x) for message in found)
+
+    source.stop(signal.SIGKILL)
+    peer.wait(lambda: by(peer, "topic"))
+    # Somebody else's camera, which tells nothing of its frames.
+    camera = peer.publisher(Image, "image_raw")
+    last = found[-1].header.stamp.sec
+    for shot in motion_frames(SimulationSettings(**SMALL_GEAR), 4):
+        late = Frame(shot.image, (last + 10 + shot.cycle) * 10**9, shot.frame_counter, shot.cycle)
+        camera.publish(messages.to_rclpy(messages.image(late)))
+    peer.wait(lambda: sum(message.header.stamp.sec > last + 5 for message in found) == 4)
+    assert localizer.stop() == 0
+    ring_path("/frame_info", domain, FOLDER).unlink()  # of the source that was killed
+
+
+@pytest.mark.parametrize("share", ["true", "false"])
+def test_results_are_the_same_by_either_way(
+    start: Start, peer: Peer, calibration: str, share: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    peer.listen(Localizations, "localizations")
+    localizer = start("localizer", "-p", f"calibration:={calibration}")
+    localizer.wait_for_line("ready")
+    small = [word for name, value in SMALL_GEAR.items() for word in ("-p", f"simulator.{name}:={value}")]
+    cycles = ["-p", "simulator.cycles:=12", "-p", "pacing:=consumer", "-p", f"share_frames:={share}"]
+    assert start("frame_source", *cycles, *small).wait() == 0
+    found = peer.received["localizations"]
+    peer.wait(lambda: len(found) == 12)
+    kept = tmp_path_factory.getbasetemp() / "localizations_by_either_way.npy"
+    places = np.concatenate([np.column_stack([m.x, m.y, m.z]) for m in found])
+    if kept.exists():
+        assert np.array_equal(np.load(kept), places, equal_nan=True)
+    np.save(kept, places)
+    assert localizer.stop() == 0

@@ -172,12 +172,14 @@ class Calibration:
 
 
 def _guarded(found: Positions, shape: Positions) -> Positions:
-    """Flag as ambiguous what all features of the ``shape`` place on another branch: one alone cannot tell."""
+    """Flag as ambiguous what all features of the ``shape`` place on another branch, with their own flags what
+    they place out of range or nowhere: one alone cannot tell."""
     difference = np.abs(found.position[:, 2] - shape.position[:, 2])
     variance = found.covariance[:, 2, 2] + shape.covariance[:, 2, 2]
     with np.errstate(invalid="ignore"):
         apart = difference > BRANCHES_APART * np.sqrt(variance)
-    elsewhere = np.where(apart, Flag.Z_AMBIGUOUS, 0) | (shape.flags & Flag.Z_OUT_OF_RANGE)
+    nowhere = shape.flags & (Flag.Z_OUT_OF_RANGE | Flag.POOR_FIT)
+    elsewhere = np.where(apart, Flag.Z_AMBIGUOUS, 0) | nowhere
     return replace(found, flags=found.flags | elsewhere.astype(np.uint32))
 
 

@@ -84,12 +84,16 @@ def learn_field(calibration: Calibration, settings: SimulationSettings, cycles: 
 
 
 def field_figures(
-    seeds: Sequence[int], calibrated: Callable[[int], Calibration], optics: str = "paper"
+    seeds: Sequence[int],
+    calibrated: Callable[[int], Calibration],
+    optics: str = "paper",
+    tell: Callable[[str], None] = lambda _: None,
 ) -> list[Figure]:
     """Rows for the table of the calibration; ``calibrated(seed)``: the ``optics`` number seed, from beads."""
     before, after = [], []
     for seed in seeds:
         gear: dict[str, Any] = {"optics": optics, "optics_seed": seed, "electrons": 6e4}
+        tell(f"optics {seed}, a gear turning")
         beads = calibrated(seed)
         learnt = learn_field(beads, SimulationSettings(seed=seed, **gear), LEARNT_CYCLES)
         # Another gear, every particle of 6e4 electrons.

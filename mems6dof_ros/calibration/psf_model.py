@@ -34,6 +34,7 @@ FIELD_ORDERS = (0, 1, 2, 3, 4)
 #: Margin of rendered windows about those of the data, px.
 MARGIN_PX = 14
 _MANY_BEADS = 20
+_LEAST_BEADS = 4
 _LEAST_SCATTER = 1e-10
 
 
@@ -147,6 +148,9 @@ def _model(
     scatter = own.T @ own / beads - noise[WAVEFRONT.start :, WAVEFRONT.start :]
     apart = max(0.0, 1 - beads / _MANY_BEADS)
     scatter = (1 - apart) * scatter + apart * np.diag(np.diag(scatter))
+    # A variance known from few beads: what is measured next follows Student's distribution.
+    count = max(beads, _LEAST_BEADS)
+    scatter *= count / (count - 2)
     stages = values[:, STAGE] * 1e-6
     surface, variance = focus(stages)
     piston = float(np.mean(heights - stages - surface(x, y)))

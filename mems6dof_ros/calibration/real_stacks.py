@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +24,12 @@ from mems6dof_ros.sources.source import frames, open_source
 
 @dataclass(frozen=True)
 class StageErrors:
-    """z against the stage with each bead's own height taken off, where not flagged: ``error`` and claimed
-    ``sd`` (n,) m. ``flagged``: the fraction of planes left out for their flags. ``common`` (n,) m: what the
-    other beads of the same image say of the stage, NaN where there are none."""
+    """z against the stage, where not flagged: ``error`` and its claimed ``sd`` (n,) m. ``flagged``: the
+    fraction of planes left out for their flags."""
 
     error: Array
     sd: Array
     flagged: float
-    common: Array
-
-    @property
-    def apart(self) -> StageErrors:
-        """Errors apart from what is common to all beads of an image: errors of the stage, above all."""
-        return replace(self, error=self.error - self.common)
 
     @property
     def rms(self) -> float:
@@ -75,6 +69,15 @@ def intrinsic_stack(folder: Path, window_px: int = 31) -> FocusStack:
     return measure_stack(frames(source), camera, DEFAULT_WEIGHTING, window_px, "intrinsic, real")
 
 
+class _Scan(NamedTuple):
+    """z against the stage as stated of every bead in every plane (b, p) m, NaN beyond reach; the claimed
+    ``variance`` m^2; which have no flag."""
+
+    z: Array
+    variance: Array
+    good: NDArray[np.bool_]
+
+
 def one_bead_left_out(
     stack: FocusStack,
     planes: Sequence[Frame],
@@ -82,42 +85,75 @@ def one_bead_left_out(
     settings: CalibrationSettings,
     methods: Sequence[str],
     beads: Sequence[int] | None = None,
-) -> dict[str, StageErrors]:
+) -> dict[str, tuple[StageErrors, StageErrors]]:
     """Calibrate from all beads but one, measure that one within ``reach`` m of its focus, for every bead or
     those of the numbers in ``beads``.
 
-    The others are measured as well: the median of their errors in an image is the stage's there.
+    Per method the errors against the stage as stated, and against the stage as the other beads in the same
+    image show it: the mean of theirs. The bead's own height is taken off.
     """
-    found: dict[str, list[tuple[Array, Array, Array, NDArray[np.bool_]]]] = {name: [] for name in methods}
+    found: dict[str, list[tuple[Array, ...]]] = {name: [] for name in methods}
     for index in range(len(stack.beads)) if beads is None else beads:
         others = replace(stack, beads=stack.beads[:index] + stack.beads[index + 1 :])
         calibration = calibrate([others], settings).calibration
         for name in methods:
-            z, sd, good = _through_focus(calibration.with_method(name), stack, planes, reach)
-            rest = np.arange(len(z)) != index
-            seen = np.isfinite(z[rest]).any(axis=0)
-            common = np.full(z.shape[1], np.nan)
-            common[seen] = np.nanmedian(z[rest][:, seen], axis=0)
-            here = np.isfinite(z[index]) & np.isfinite(common)
-            if (used := here & good[index]).any():  # the bead's own height against the others'
-                common += np.mean((z[index] - common)[used])
-            found[name].append((z[index, here], sd[index, here], common[here], good[index, here]))
+            scan = _through_focus(calibration.with_method(name), stack, planes, reach)
+            found[name].append(_against_others(scan, index))
     results = {}
     for name, parts in found.items():
-        error, sd, common, good = (np.concatenate(column) for column in zip(*parts, strict=True))
-        results[name] = StageErrors(error[good], sd[good], 1 - float(np.mean(good)), common[good])
+        *columns, good = (np.concatenate(column) for column in zip(*parts, strict=True))
+        use, flagged = good.astype(bool), 1 - float(np.mean(good))
+        stated, stated_sd, apart, apart_sd = (column[use] for column in columns)
+        results[name] = StageErrors(stated, stated_sd, flagged), StageErrors(apart, apart_sd, flagged)
     return results
+
+
+def stage_departures(
+    stack: FocusStack,
+    planes: Sequence[Frame],
+    reach: float,
+    settings: CalibrationSettings,
+    methods: Sequence[str],
+) -> dict[str, Array]:
+    """What all beads within ``reach`` m of their foci say in common of where the stage stood in each plane
+    (p,) m, against the position stated; NaN where none says anything."""
+    calibration = calibrate([stack], settings).calibration
+    found = {}
+    for name in methods:
+        scan = _through_focus(calibration.with_method(name), stack, planes, reach)
+        weight = np.where(scan.good, 1 / scan.variance, 0.0)
+        with np.errstate(invalid="ignore"):
+            found[name] = np.sum(weight * np.nan_to_num(scan.z), axis=0) / weight.sum(axis=0)
+    return found
+
+
+def _against_others(scan: _Scan, index: int) -> tuple[Array, ...]:
+    """Of the bead ``index``: error and sd against the stage as stated, error and sd against the other beads,
+    and which have no flag. The others' own uncertainty is in the latter sd."""
+    others = np.arange(len(scan.z)) != index
+    weight = np.where(scan.good, 1 / scan.variance, 0.0)[others]
+    seen = np.isfinite(scan.z[index]) & (weight.sum(axis=0) > 0)
+    weight, z, good = weight[:, seen], scan.z[index, seen], scan.good[index, seen]
+    stage_variance = 1 / weight.sum(axis=0)
+    stage = np.sum(weight * np.nan_to_num(scan.z[others][:, seen]), axis=0) * stage_variance
+    variance = scan.variance[index, seen]
+    # The bead's own height, the mean, takes a part of the error with it.
+    count = max(int(np.count_nonzero(good)), 2)
+    results = []
+    for error, total in ((z, variance), (z - stage, variance + stage_variance)):
+        height = np.mean(error[good]) if good.any() else 0.0
+        results += [error - height, np.sqrt(total * (1 - 1 / count))]
+    return (*results, good)
 
 
 def _through_focus(
     calibration: Calibration, stack: FocusStack, planes: Sequence[Frame], reach: float
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """z against the stage of every bead in every plane (b, p) m about the bead's mean, NaN beyond ``reach``;
-    claimed sd; which have no flag."""
+) -> _Scan:
+    """All beads of ``stack`` within ``reach`` of their foci; z about the mean of each."""
     shape = len(stack.beads), len(planes)
     psf = calibration.psf if calibration.method == "psf" else None
     surface = (psf or calibration.model).focus_variance
-    z, sd, good = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+    z, variance, good = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     for plane, frame in enumerate(planes):
         at = [
             (number, int(np.argmin(np.abs(bead.stage_z - frame.stage_z))))
@@ -135,12 +171,12 @@ def _through_focus(
             )
         )
         found = calibration.locate(fits, frame.image)
-        z[beads, plane] = found.position[:, 2] + frame.stage_z
+        z[beads, plane] = found.position[: len(at), 2] + frame.stage_z
         # Own heights are taken off, and with them what the focus surface is uncertain by.
-        sd[beads, plane] = np.sqrt(found.covariance[:, 2, 2] - surface)
-        good[beads, plane] = found.flags == 0
+        variance[beads, plane] = found.covariance[: len(at), 2, 2] - surface
+        good[beads, plane] = found.flags[: len(at)] == 0
     count = np.maximum(good.sum(axis=1, keepdims=True), 1)
-    return z - np.sum(np.where(good, z, 0.0), axis=1, keepdims=True) / count, sd, good
+    return _Scan(z - np.sum(np.where(good, z, 0.0), axis=1, keepdims=True) / count, variance, good)
 
 
 def one_plane_left_out(stack: FocusStack, reach: float, orders: Orders) -> StageErrors:
@@ -156,7 +192,7 @@ def one_plane_left_out(stack: FocusStack, reach: float, orders: Orders) -> Stage
         if found.flags[0] == 0:
             error.append(found.position[0, 2] + bead.stage_z[index] - result.fit.sharpest[0])
             sd.append(np.sqrt(found.covariance[0, 2, 2]))
-    return StageErrors(np.array(error), np.array(sd), 1 - len(error) / seen, np.full(len(error), np.nan))
+    return StageErrors(np.array(error), np.array(sd), 1 - len(error) / seen)
 
 
 def plain_orders(field: int, degree: int) -> Orders:

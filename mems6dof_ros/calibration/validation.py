@@ -7,6 +7,7 @@ that no single focus stack can tell, so one plane is taken off the z errors of e
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.field_validation import field_figures
 from mems6dof_ros.calibration.file import Calibration
 from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, FocusStack, measure_stack
+from mems6dof_ros.calibration.interface import Positions
 from mems6dof_ros.calibration.real_stacks import (
     ASTIGMATIC,
     astigmatic_frames,
@@ -31,6 +33,7 @@ from mems6dof_ros.calibration.real_stacks import (
     one_bead_left_out,
     one_plane_left_out,
     plain_orders,
+    stage_departures,
 )
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.figures import Figure, at_least, at_most, between, information
@@ -43,7 +46,8 @@ from mems6dof_ros.simulation.optics import Objective, Optics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
 
-Progress = Callable[[int, int], None]
+#: Says what is being measured.
+Tell = Callable[[str], None]
 
 #: The stacks reach beyond the range that the calibration declares valid.
 STACK_REACH, STACK_STEP, VALID_RANGE = 6.6e-6, 0.2e-6, 4.2e-6
@@ -135,9 +139,17 @@ def held_out(
     return found
 
 
+def located(calibration: Calibration, particles: Particles) -> Positions:
+    """Positions of ``particles``, one for each."""
+    found = calibration.locate(particles.fits, particles.image)
+    # Where the pixels show two in what one Gaussian was fitted to, the second comes after all others.
+    n = len(particles.fits)
+    return Positions(found.position[:n], found.covariance[:n], found.z_gap[:n], found.flags[:n])
+
+
 def errors(calibration: Calibration, particles: Sequence[Particles]) -> Errors:
     """Locate ``particles`` and compare with truth."""
-    found = [calibration.locate(p.fits, p.image) for p in particles]
+    found = [located(calibration, p) for p in particles]
     good = np.concatenate([f.flags == 0 for f in found]) & np.concatenate(
         [p.fits.flags == 0 for p in particles]
     )
@@ -203,37 +215,12 @@ def axial_bound(particles: Sequence[Particles], seed: int, background: float, re
     return np.concatenate(bounds)
 
 
-def figures(
-    seeds: Sequence[int], real_data: Path | None, progress: Progress = lambda done, total: None
-) -> list[Figure]:
-    """The whole table; ``seeds``: the optics to average over; ``real_data``: folder of real micrographs."""
-    parts: list[Callable[[Sequence[int]], list[Figure]]] = [
-        accuracy_figures,
-        bound_figures,
-        brightness_figures,
-        sign_change_figures,
-        range_figures,
-        bad_stack_figures,
-        lambda seeds: field_figures(seeds, lambda seed: _calibration("paper", seed, 1e5)),
-    ]
-    table: list[Figure] = []
-    steps = len(parts) + 1
-    for number, part in enumerate(parts):
-        progress(number, steps)
-        table += part(seeds)
-    progress(len(parts), steps)
-    if real_data is not None:
-        table += real_figures(real_data)
-    progress(steps, steps)
-    return table
-
-
 @cache
 def _calibration(optics: str, seed: int, electrons: float) -> Calibration:
     return calibrated(optics, seed, electrons)
 
 
-def accuracy_figures(seeds: Sequence[int]) -> list[Figure]:
+def accuracy_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
     """z with local aberration, within 1.5 um of focus, calibrated at 1e5 electrons."""
     limits = {
         ("rho_amp", 3e4): 80,
@@ -246,6 +233,7 @@ def accuracy_figures(seeds: Sequence[int]) -> list[Figure]:
     for electrons in (3e4, 1e5):
         sets = {}
         for seed in seeds:
+            tell(f"optics {seed}, {electrons:.0e} electrons")
             calibration = _calibration("paper", seed, 1e5)
             sets[seed] = held_out(calibration, "paper", seed, electrons, 1.5e-6)
         for method in METHODS:
@@ -263,13 +251,14 @@ def accuracy_figures(seeds: Sequence[int]) -> list[Figure]:
     return table
 
 
-def bound_figures(seeds: Sequence[int]) -> list[Figure]:
+def bound_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
     """z over the Cramer-Rao bound: smooth aberrations, equal spheres, 1e5 electrons."""
     equal: dict[str, Any] = {"diameter_spread": 0.0, "brightness_spread": 0.0}
     limits = {"joint": 1.5, "psf": 1.15}
     found: dict[str, list[Errors]] = {method: [] for method in limits}
     bound = []
     for seed in seeds:
+        tell(f"smooth optics {seed}")
         calibration = calibrated("smooth", seed, 1e5, **equal)
         particles = held_out(calibration, "smooth", seed, 1e5, 1.5e-6, **equal)
         for method, parts in found.items():
@@ -288,28 +277,40 @@ def bound_figures(seeds: Sequence[int]) -> list[Figure]:
     return table
 
 
-def brightness_figures(seeds: Sequence[int]) -> list[Figure]:
-    """Calibrated at 3e5 electrons, measured dimmer and brighter, against calibrated in kind."""
-    seed = seeds[0]
+def brightness_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
+    """Calibrated at 3e5 electrons, measured dimmer and brighter, against calibrated in kind.
+
+    A calibration in kind has random errors of its own, several nm from 97 beads of 3e4 electrons: what
+    brightness does is what all sets of optics have in common.
+    """
     table = []
     for electrons in (3e4, 1e6):
-        other, kind = (_calibration("paper", seed, e) for e in (3e5, electrons))
-        particles = held_out(kind, "paper", seed, electrons, 1.5e-6)
+        crossed: dict[str, list[Errors]] = {method: [] for method in METHODS}
+        same: dict[str, list[Errors]] = {method: [] for method in METHODS}
+        bias: dict[str, list[Array]] = {method: [] for method in METHODS}
+        for seed in seeds:
+            tell(f"optics {seed}, calibrated at 3e5 and {electrons:.0e} electrons")
+            other, kind = (_calibration("paper", seed, e) for e in (3e5, electrons))
+            particles = held_out(kind, "paper", seed, electrons, 1.5e-6)
+            for method in METHODS:
+                pair = other.with_method(method), kind.with_method(method)
+                crossed[method].append(errors(pair[0], particles))
+                same[method].append(errors(pair[1], particles))
+                bias[method].append(_difference(*pair, particles))
         for method in METHODS:
-            crossed, same = (c.with_method(method) for c in (other, kind))
-            ratio = errors(crossed, particles).rms(2) / errors(same, particles).rms(2)
             name = f"{method}, calibrated at 3e5, measured at {electrons:.0e}"
+            ratio = pooled(crossed[method]).rms(2) / pooled(same[method]).rms(2)
+            worst = float(np.max(np.abs(np.mean(bias[method], axis=0))))
             table.append(at_most(f"z rms over calibrated in kind, {name}", ratio, 1.1))
-            bias = _bias_difference(crossed, same, particles)
-            table.append(at_most(f"bias of z against calibrated in kind, {name}, nm", bias * 1e9, 5))
+            table.append(at_most(f"bias of z against calibrated in kind, {name}, nm", worst * 1e9, 5))
     return table
 
 
-def _bias_difference(one: Calibration, other: Calibration, particles: Sequence[Particles]) -> float:
-    """|mean z difference| that depends on defocus: the worst of three ranges about their common mean."""
+def _difference(one: Calibration, other: Calibration, particles: Sequence[Particles]) -> Array:
+    """Mean z difference (3,) m in the lower, middle and upper third of z, a plane over all taken off."""
     difference, z = [], []
     for p in particles:
-        a, b = one.locate(p.fits, p.image), other.locate(p.fits, p.image)
+        a, b = located(one, p), located(other, p)
         good = (a.flags == 0) & (b.flags == 0)
         difference.append((a.position - b.position)[good])
         z.append(p.position[good])
@@ -317,46 +318,50 @@ def _bias_difference(one: Calibration, other: Calibration, particles: Sequence[P
     plane = np.column_stack([np.ones(len(at)), at[:, :2]])
     change = change - plane @ np.linalg.lstsq(plane, change, rcond=None)[0]
     thirds = np.digitize(at[:, 2], np.quantile(at[:, 2], [1 / 3, 2 / 3]))
-    return float(max(abs(np.mean(change[thirds == k])) for k in range(3)))
+    return np.array([np.mean(change[thirds == k]) for k in range(3)])
 
 
-def sign_change_figures(seeds: Sequence[int]) -> list[Figure]:
+def sign_change_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
     """Optics whose 45-degree astigmatism changes sign inside the field, 1e5 electrons, +/-4 um."""
-    seed = seeds[0]
-    calibration = _calibration("sign_change", seed, 1e5)
-    particles = held_out(calibration, "sign_change", seed, 1e5, 4e-6, frames=10)
-    table = []
-    for method in METHODS:
-        found = errors(calibration.with_method(method), particles)
-        worst = float(np.max(np.abs(found.error[:, 2]) / found.sd[:, 2]))
-        table.append(at_most(f"worst unflagged z, sign change, {method}, claimed sd", worst, 5))
-        used = len(found.error) / found.seen
-        table.append(information(f"particles without a flag, sign change, {method}", used))
-    return table
+    return _unflagged("sign_change", "sign change", seeds, tell)
 
 
-def range_figures(seeds: Sequence[int]) -> list[Figure]:
+def range_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
     """Within 4 um of focus right or flagged; beyond the valid range flagged."""
+    table = _unflagged("paper", "within 4 um", seeds, tell)
+    missed = dict.fromkeys(METHODS, 0)
+    for seed in seeds:
+        tell(f"optics {seed}, to 8 um")
+        calibration = _calibration("paper", seed, 1e5)
+        for p in held_out(calibration, "paper", seed, 1e5, 8e-6, frames=16):
+            outside = np.abs(p.position[:, 2]) > VALID_RANGE + 0.6e-6
+            for method in METHODS:
+                flags = located(calibration.with_method(method), p).flags | p.fits.flags
+                missed[method] += int(np.count_nonzero((flags == 0) & outside))
+    return table + [at_most(f"unflagged beyond the range, {m}, particles", n, 0) for m, n in missed.items()]
+
+
+def _unflagged(optics: str, name: str, seeds: Sequence[int], tell: Tell) -> list[Figure]:
+    """The worst z without a flag within 4 um of focus, and how many have none."""
+    found: dict[str, list[Errors]] = {method: [] for method in METHODS}
+    for seed in seeds:
+        tell(f"optics {seed}, {name}")
+        calibration = _calibration(optics, seed, 1e5)
+        particles = held_out(calibration, optics, seed, 1e5, 4e-6, frames=10)
+        for method, parts in found.items():
+            parts.append(errors(calibration.with_method(method), particles))
     table = []
-    seed = seeds[0]
-    calibration = _calibration("paper", seed, 1e5)
-    within = held_out(calibration, "paper", seed, 1e5, 4e-6, frames=10)
-    beyond = held_out(calibration, "paper", seed, 1e5, 8e-6, frames=16)
-    for method in METHODS:
-        chosen = calibration.with_method(method)
-        found = errors(chosen, within)
-        worst = float(np.max(np.abs(found.error[:, 2]) / found.sd[:, 2]))
-        table.append(at_most(f"worst unflagged z within 4 um, {method}, claimed sd", worst, 5))
-        used = len(found.error) / found.seen
-        table.append(information(f"particles without a flag within 4 um, {method}", used))
-        far = [chosen.locate(p.fits, p.image).flags | p.fits.flags for p in beyond]
-        outside = [np.abs(p.position[:, 2]) > VALID_RANGE + 0.6e-6 for p in beyond]
-        missed = sum(int(np.count_nonzero((f == 0) & o)) for f, o in zip(far, outside, strict=True))
-        table.append(at_most(f"unflagged beyond the range, {method}, particles", missed, 0))
+    for method, parts in found.items():
+        every = pooled(parts)
+        worst = float(np.max(np.abs(every.error[:, 2]) / every.sd[:, 2]))
+        table.append(at_most(f"worst unflagged z, {name}, {method}, claimed sd", worst, 5))
+        table.append(
+            information(f"particles without a flag, {name}, {method}", len(every.error) / every.seen)
+        )
     return table
 
 
-def bad_stack_figures(seeds: Sequence[int]) -> list[Figure]:
+def bad_stack_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
     """Stacks that must be refused or warned about: 1 where they are."""
     settings = SimulationSettings(
         clumps=0, width_px=640, height_px=640, optics_seed=seeds[0], electrons=1e5, seed=seeds[0]
@@ -391,37 +396,79 @@ def bad_stack_figures(seeds: Sequence[int]) -> list[Figure]:
     }
     table = []
     for name, (stack, reference, word) in cases.items():
-        said = outcome(stack, reference)
-        table.append(
-            at_least(f"{name}: {said or 'no complaint'}", float((word in said) if word else not said), 1)
-        )
+        tell(name)
+        table.append(_complaint(name, outcome(stack, reference), word))
     camera = replace(camera, saturation_adu=ceiling)
-    said = outcome(saturated)
-    table.append(at_least(f"saturation: {said or 'no complaint'}", float("saturated" in said), 1))
+    table.append(_complaint("saturation", outcome(saturated), "saturated"))
     return table
 
 
-def real_figures(folder: Path) -> list[Figure]:
-    """Real micrographs: see the README of the data."""
+def _complaint(name: str, said: str, word: str) -> Figure:
+    """1 where ``word`` is among what was ``said`` of a stack; without a word, where nothing was."""
+    passed = (word in said) if word else not said
+    return at_least(f"{name}: {textwrap.shorten(said or 'no complaint', 90)}", float(passed), 1)
+
+
+def real_figures(folder: Path, tell: Tell) -> list[Figure]:
+    """Real micrographs (see the README of the data), which have no truth but the stage.
+
+    The astigmatic stage did not make the steps that are stated: two methods that share no feature
+    see the same departures in all beads. Against the stage as stated no method can be better than that; the
+    requirement is asked of the error against the stage as the other beads show it.
+    """
     planes = astigmatic_frames(folder)
+    stack, methods = astigmatic_stack(planes), ("joint", "psf")
     settings = replace(ASTIGMATIC, orders=plain_orders(0, 6))
-    astigmatic = one_bead_left_out(astigmatic_stack(planes), planes, 500e-9, settings, ("joint", "psf"))
-    steps = one_plane_left_out(intrinsic_stack(folder), 1.05e-6, plain_orders(0, 6))
-    table = []
-    for method, against_stage in astigmatic.items():
-        name = f"{method}, real astigmatic stack"
-        apart, wanted = against_stage.apart, method == "psf"
+    reach = 500e-9
+    tell("what all beads say of the stage")
+    seen = stage_departures(stack, planes, reach, settings, methods)
+    steps = np.diff([seen[method] for method in methods])
+    steps = steps[:, np.isfinite(steps).all(axis=0)]
+    table = [
+        *(
+            information(
+                f"real astigmatic stage, steps against 100 nm, as all beads see them, {m}, nm rms", rms
+            )
+            for m, rms in zip(methods, np.std(steps, axis=1) * 1e9, strict=True)
+        ),
+        information("correlation of the steps that the two methods see", np.corrcoef(steps)[0, 1]),
+    ]
+    tell("one bead after another left out")
+    for method, (stated, others) in one_bead_left_out(stack, planes, reach, settings, methods).items():
+        name = f"real astigmatic bead left out, {method}"
+        wanted = method == "psf"
         table += [
-            information(f"z rms against the stage as stated, {name}, nm", against_stage.rms * 1e9),
-            information(f"median |z error| against it, {name}, nm", against_stage.median * 1e9),
-            at_most(f"z rms, one bead left out, {name}, nm", apart.rms * 1e9, 30 if wanted else None),
-            at_most(f"median |z error|, {name}, nm", apart.median * 1e9, 18 if wanted else None),
-            between(f"claimed over actual, {name}", apart.claimed_over_actual, 0.9, 1.15),
-            information(f"flagged, {name}", against_stage.flagged),
+            at_most(f"z against the other beads, {name}, nm rms", others.rms * 1e9, 30 if wanted else None),
+            at_most(
+                f"z against the other beads, {name}, nm median", others.median * 1e9, 18 if wanted else None
+            ),
+            between(f"claimed over actual, {name}", others.claimed_over_actual, 0.9, 1.15),
+            information(f"z against the stage as stated, {name}, nm rms", stated.rms * 1e9),
+            information(f"z against the stage as stated, {name}, nm median", stated.median * 1e9),
+            information(f"flagged, {name}", others.flagged),
         ]
+    tell("one plane after another left out")
+    intrinsic = one_plane_left_out(intrinsic_stack(folder), 1.05e-6, plain_orders(0, 6))
     return [
         *table,
-        information("stage steps, real intrinsic bead, one plane left out, rms nm", steps.rms * 1e9),
-        information("flagged, real intrinsic bead", steps.flagged),
-        between("claimed over actual, real intrinsic bead", steps.claimed_over_actual, 0.9, 1.15),
+        information("stage steps, real intrinsic bead, one plane left out, nm rms", intrinsic.rms * 1e9),
+        information("flagged, real intrinsic bead", intrinsic.flagged),
+        between("claimed over actual, real intrinsic bead", intrinsic.claimed_over_actual, 0.9, 1.15),
     ]
+
+
+def learnt_field_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
+    """x and y after field self-calibration, see field_validation."""
+    return field_figures(seeds, lambda seed: _calibration("paper", seed, 1e5), tell=tell)
+
+
+#: Parts of the table from simulated optics, of the numbers ``seeds``; then come ``real_figures``.
+PARTS: dict[str, Callable[[Sequence[int], Tell], list[Figure]]] = {
+    "accuracy": accuracy_figures,
+    "bound": bound_figures,
+    "brightness": brightness_figures,
+    "sign_change": sign_change_figures,
+    "range": range_figures,
+    "bad_stacks": bad_stack_figures,
+    "field": learnt_field_figures,
+}

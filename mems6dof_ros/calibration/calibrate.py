@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mems6dof_ros import __version__
 from mems6dof_ros.calibration.checks import (
@@ -111,17 +112,15 @@ def calibrate(
         curves = [_curve(bead, index, reference, first) for index, bead in beads]
         interval = _interval(curves)
         fit = fit_model(curves, reference, interval, settings.orders, settings.rotations, progress)
-        departure = _departures(fit)
+        departure, feature = _departures(fit)
         outliers = departure > OUTLIER
         if not outliers.any() or len(beads) < FEW_BEADS:
             break
-        for (index, bead), ratio in zip(
-            [beads[k] for k in np.flatnonzero(outliers)], departure[outliers], strict=True
-        ):
+        for k in np.flatnonzero(outliers):
+            index, bead = beads[k]
             x, y = bead.fits.parameters[bead.in_focus, :2]
-            rejected.append(
-                Rejection(x, y, f"departs from its neighbours: {ratio:.0f} times the usual scatter", index)
-            )
+            what = "drifts" if FEATURES[feature[k]] in ("dx", "dy") else "departs from its neighbours"
+            rejected.append(Rejection(x, y, f"{what}: {departure[k]:.0f} times the usual scatter", index))
         beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
     chosen = [bead for _, bead in beads]
     illumination = _illumination(chosen, curves, radius)
@@ -241,11 +240,13 @@ def _interval(curves: Sequence[BeadCurve]) -> tuple[float, float]:
     return interval
 
 
-def _departures(fit: ModelFit) -> Array:
-    """Mean square of each bead's held-out residuals over the median bead's, worst feature (b,)."""
+def _departures(fit: ModelFit) -> tuple[Array, NDArray[np.intp]]:
+    """Mean square of each bead's held-out residuals over the median bead's, in the worst feature (b,), and
+    which of FEATURES that is (b,)."""
     square = np.array([np.mean(residual**2, axis=0) for residual in fit.residual])
     kept = square[:, : FEATURES.index("rho_amp")]
-    return np.max(kept / np.maximum(np.median(kept, axis=0), 1e-30), axis=1)
+    ratio = kept / np.maximum(np.median(kept, axis=0), 1e-30)
+    return np.max(ratio, axis=1), np.argmax(ratio, axis=1)
 
 
 def _valid_range(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from mems6dof_ros.calibration.calibrate import CalibrationSettings, calibrate
 from mems6dof_ros.calibration.focus_stack import measure_stack
@@ -69,6 +70,25 @@ def test_direction_and_step_against_a_reference(frames, good):
 def test_drift_is_noticed(frames):
     drifting = [replace(f, image=np.roll(f.image, round(0.4 * k), axis=1)) for k, f in enumerate(frames)]
     assert any("drift" in w for w in calibrate([measured(drifting)], QUICK).warnings)
+
+
+def test_a_bead_that_drifts_by_itself_is_rejected(frames, good):
+    """One bead, moved by 30 nm a plane, among 20 that stay."""
+    bead = good.beads[0]
+    column, row = np.rint(bead.fits.parameters[bead.in_focus, :2]).astype(int)
+    part = np.s_[row - 22 : row + 23, column - 22 : column + 23]
+
+    def moved(frame: Frame, shift_px: float) -> Frame:
+        image = frame.image.copy()
+        window = image[part].astype(float)
+        image[part] = np.rint(ndimage.shift(window, (0, shift_px), order=3, mode="nearest"))
+        return replace(frame, image=image)
+
+    step = 30e-9 / SETTINGS.pixel_size
+    drifting = [moved(frame, step * (k - len(frames) / 2)) for k, frame in enumerate(frames)]
+    rejected = calibrate([measured(drifting)], QUICK).rejected
+    near = [r for r in rejected if np.hypot(r.x_px - column, r.y_px - row) < 5]
+    assert [r.reason.split(":")[0] for r in near] == ["drifts"]
 
 
 def test_saturated_beads_are_rejected(frames):

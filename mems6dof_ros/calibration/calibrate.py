@@ -119,7 +119,8 @@ def calibrate(
         for k in np.flatnonzero(outliers):
             index, bead = beads[k]
             x, y = bead.fits.parameters[bead.in_focus, :2]
-            what = "drifts" if FEATURES[feature[k]] in ("dx", "dy") else "departs from its neighbours"
+            sideways = FEATURES[feature[k]] in ("dx", "dy")
+            what = "drifts, or moves in another's light" if sideways else "departs from its neighbours"
             rejected.append(Rejection(x, y, f"{what}: {departure[k]:.0f} times the usual scatter", index))
         beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
     chosen = [bead for _, bead in beads]

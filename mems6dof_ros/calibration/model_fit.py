@@ -382,18 +382,20 @@ def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Arra
     for index, node in enumerate(nodes):
         weight = np.clip(1 - np.abs(u - node) / width, 0, None)
         excess = r[:, :, None] * r[:, None, :] - noise
-        mean = np.einsum("n,nkl->kl", weight, excess) / max(weight.sum(), 1e-12)
+        weight_sum = max(weight.sum(), 1e-12)
+        mean = np.einsum("n,nkl->kl", weight, excess) / weight_sum
         modes = _MODES @ mean @ _MODES.T
         modes = (1 - apart) * modes + apart * np.diag(np.diag(modes))
         # A variance known from few residuals: what is measured next follows Student's distribution.
         count = max(weight.sum() ** 2 / max(np.sum(weight**2), 1e-12), _LEAST_RESIDUALS)
-        found[index] = count / (count - 2) * _positive(_MODES.T @ modes @ _MODES)
+        # In units of all that is left over, noise included: the excess alone may be next to nothing.
+        units = np.sqrt(np.maximum(np.sum(weight[:, None] * (r @ _MODES.T) ** 2, axis=0) / weight_sum, 1e-24))
+        found[index] = count / (count - 2) * _MODES.T @ _positive(modes, units) @ _MODES
     return found
 
 
-def _positive(matrix: Array) -> Array:
-    """The nearest positive semidefinite matrix, in units in which the diagonal is 1."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-24))
+def _positive(matrix: Array, scale: Array) -> Array:
+    """The nearest positive semidefinite matrix, in units of ``scale`` (k,)."""
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     return (vectors * np.maximum(values, 1e-6)) @ vectors.T * np.outer(scale, scale)
 

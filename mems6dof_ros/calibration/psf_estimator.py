@@ -135,7 +135,7 @@ class PsfEstimator:
             components.images,
             np.ascontiguousarray(curves),
             np.array(components.curves.interval),
-            model.misfit,
+            model.pixel_misfit,
             parameters,
             covariance,
             quality,

@@ -53,8 +53,8 @@ class BeadWindows:
 
 @dataclass(frozen=True)
 class Retrieval:
-    """``parameters`` (COUNT,) of a bead, their ``covariance``, and ``misfit``: the relative error of the
-    model, beyond noise."""
+    """``parameters`` (COUNT,) of a bead, their ``covariance``, and ``misfit``: mean square of the relative
+    error of the model, beyond noise; below zero by chance."""
 
     parameters: Array
     covariance: Array
@@ -152,6 +152,6 @@ class _Objective:
 
     @property
     def misfit(self) -> float:
-        """Relative error m of the model at the last expansion, where the light is: what is left over has the
-        variance of the noise plus (m signal)^2, weighted with the signal."""
-        return float(np.sqrt(max(self._excess, 0.0) / max(self._signal, 1e-12)))
+        """Mean square relative error m^2 of the model at the last expansion, where the light is: what is left
+        over has the variance of the noise plus (m signal)^2, weighted with the signal."""
+        return self._excess / max(self._signal, 1e-12)

@@ -61,6 +61,13 @@ class PsfModel:
     interval: tuple[float, float]
     misfit: float
 
+    @property
+    def pixel_misfit(self) -> float:
+        """``misfit`` as it would be, were it every pixel's own: images are band-limited to 2 NA / lambda, so
+        that pixels within lambda / 4 NA of each other are wrong together."""
+        cell = self.imaging.wavelength / (4 * self.imaging.numerical_aperture)
+        return self.misfit * max(1.0, cell / self.imaging.pixel_size)
+
     def at(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Wavefronts (n, terms) waves and chief-ray slopes (n, 2) rad at field positions (n,) m."""
         order = zernike_order(self.wavefront.shape[1])
@@ -166,7 +173,7 @@ def _model(
         variance,
         _positive(scatter),
         (interval[0] - piston, interval[1] - piston),
-        float(np.sqrt(np.mean([r.misfit**2 for r in found]))),
+        float(np.sqrt(max(float(np.mean([r.misfit for r in found])), 0.0))),
     )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader
@@ -90,7 +91,7 @@ def amplitude_curves(result: CalibrationResult) -> Picture:
     picture = Picture(figsize=(6.5, 4), layout="constrained")
     axis = picture.subplots()
     for bead, sharpest in zip(result.beads, result.fit.sharpest, strict=True):
-        axis.plot((sharpest - bead.stage_z) * 1e6, rho_amp_of_scan(bead), ".", ms=1.5, color="0.6", alpha=0.5)
+        axis.plot((sharpest - bead.stage_z) * 1e6, rho_amp_of_scan(bead), **_dots(result))
     bead = result.stacks[0].beads[max(result.stacks[0].shown, 0)]
     z, r = bead.stage_z[bead.in_focus] - bead.stage_z, rho_amp_of_scan(bead)
     near = np.abs(z) <= _PAPER_RANGE
@@ -99,7 +100,10 @@ def amplitude_curves(result: CalibrationResult) -> Picture:
     at = np.linspace(float(r[near].min()), float(r[near].max()), 400)
     axis.plot(z[near] * 1e6, r[near], "k.", ms=4, label="the bead nearest to the centre")
     axis.plot(polynomial(at) * 1e6, at, "C3", lw=1, label=f"its polynomial z(ρ_amp) of order {degree}")
-    axis.set(xlabel="z / µm", ylabel="ρ_amp", xlim=(-5, 5), ylim=(1.3 * r[near].min(), 1.3 * r[near].max()))
+    reach = 1.25e6 * float(np.abs(z[near]).max())
+    axis.set(
+        xlabel="z / µm", ylabel="ρ_amp", xlim=(-reach, reach), ylim=(1.3 * r[near].min(), 1.3 * r[near].max())
+    )
     axis.legend()
     return picture
 
@@ -148,7 +152,7 @@ def feature_curves(result: CalibrationResult) -> Picture:
             values = curve.features[:, index].copy()
             if name in ("dx", "dy"):
                 values -= values[int(np.argmin(np.abs(u)))]
-            axis.plot(u * 1e6, values * scale, ".", ms=1, color="0.6", alpha=0.5)
+            axis.plot(u * 1e6, values * scale, **_dots(result))
         axis.plot(u_model * 1e6, model[:, index] * scale, "C3", lw=1)
         low, high = np.percentile(model[:, index] * scale, [0, 100])
         margin = 0.5 * (high - low)
@@ -165,12 +169,12 @@ def scatter(result: CalibrationResult) -> Picture:
     for name in ("ln_sigma_x", "ln_sigma_y", "atanh_rho"):
         index = FEATURES.index(name)
         left.plot(model.nodes * 1e6, np.sqrt(model.scatter[:, index, index]), label=_LABELS[name])
-    left.set(title="scatter of shapes, fit noise taken off", xlabel="defocus / µm", ylabel="1")
+    left.set(title="scatter of shapes, fit noise taken off", xlabel="defocus / µm", ylim=(0, None))
     left.legend()
     residual = np.concatenate(result.fit.residual)
     u = np.concatenate(result.fit.defocus)
     index = FEATURES.index("atanh_rho")
-    right.plot(u * 1e6, residual[:, index], ".", ms=1, alpha=0.4)
+    right.plot(u * 1e6, residual[:, index], **_dots(result))
     limit = float(np.percentile(np.abs(residual[:, index]), 99))
     right.set(title="held-out residuals of atanh ρ", xlabel="defocus / µm", ylim=(-1.5 * limit, 1.5 * limit))
     return picture
@@ -179,7 +183,7 @@ def scatter(result: CalibrationResult) -> Picture:
 def cross_validation(result: CalibrationResult) -> Picture | None:
     """Held-out scores against Zernike order, one line per polynomial degree, for every group."""
     tables = result.fit.validation.curves
-    if not tables:
+    if not any(len(table) > 1 for table in tables.values()):
         return None
     picture = Picture(figsize=(11, 3.2), layout="constrained")
     for axis, name in zip(picture.subplots(1, len(GROUPS)), GROUPS, strict=True):
@@ -189,14 +193,17 @@ def cross_validation(result: CalibrationResult) -> Picture | None:
         chosen = result.fit.orders.field[name], result.fit.orders.degree[name]
         if chosen in tables[name]:
             axis.plot(chosen[0], tables[name][chosen], "ko", mfc="none", ms=10)
-        axis.set(title=f"{name}: order {chosen[0]}, degree {chosen[1]}", xlabel="Zernike order")
+        axis.set_title(f"{name}: order {chosen[0]}, degree {chosen[1]}", fontsize=10)
+        axis.set(xlabel="Zernike order", xticks=sorted({order for order, _ in tables[name]}))
     picture.axes[0].set_ylabel("squared residual over variance")
     picture.axes[-1].legend(fontsize=7)
     return picture
 
 
-def focus_surface(result: CalibrationResult) -> Picture:
+def focus_surface(result: CalibrationResult) -> Picture | None:
     """Height of the sharpest focus over the field, with the beads' own heights."""
+    if len(result.beads) < 3:
+        return None
     valid = result.calibration.valid
     x, y = np.meshgrid(np.linspace(*valid.x, 60), np.linspace(*valid.y, 60))
     z = result.calibration.model.focus(x.ravel(), y.ravel()).reshape(x.shape)
@@ -284,6 +291,11 @@ def _centre(result: CalibrationResult) -> tuple[Array, Array]:
     u = np.linspace(*curves.interval, 300)
     local = curves.local(np.zeros(1), np.zeros(1))[0]
     return u, curves.basis(u) @ local.T
+
+
+def _dots(result: CalibrationResult) -> dict[str, Any]:
+    """How single measurements of many or few beads are drawn."""
+    return {"ls": "", "marker": ".", "ms": 1.5 if len(result.beads) > 30 else 4, "color": "0.6", "alpha": 0.5}
 
 
 def _png(picture: Picture) -> str:

@@ -88,7 +88,7 @@ def test_a_bead_that_drifts_by_itself_is_rejected(frames, good):
     drifting = [moved(frame, step * (k - len(frames) / 2)) for k, frame in enumerate(frames)]
     rejected = calibrate([measured(drifting)], QUICK).rejected
     near = [r for r in rejected if np.hypot(r.x_px - column, r.y_px - row) < 5]
-    assert [r.reason.split(":")[0] for r in near] == ["drifts"]
+    assert [r.reason.split(",")[0] for r in near] == ["drifts"]
 
 
 def test_saturated_beads_are_rejected(frames):

@@ -230,6 +230,8 @@ def declare(
             if not isinstance(parameter.default, (tuple, list)):
                 raise InputError(f"parameter {name}", "nothing", _TYPE_NAMES[parameter.type])
             value = []
+        if value == []:  # otherwise whoever asks for all parameters of the node is told of none
+            node.set_parameters([RosParameter(name, RosParameter.Type(parameter.type), value)])
         values[name] = value
         if reason := parameter.check(values[name]):
             found, expected = reason.removeprefix("found ").split("; expected ", 1)

@@ -193,7 +193,8 @@ def _subscriptions(node: NodeSpec) -> Sequence[str]:
     if node.executable == "recorder":
         return list(node.parameters["topics"])
     if node.executable in ("frame_source", "pipeline"):
-        return [node.parameters["acknowledged_by"]] if node.parameters["pacing"] == "consumer" else []
+        paced = node.parameters.get("pacing") == "consumer"
+        return [node.parameters["acknowledged_by"]] if paced else []
     return _SUBSCRIBED.get(node.executable, ())
 
 
@@ -204,7 +205,7 @@ def _live(values: Mapping[str, str]) -> list[NodeSpec]:
         source = NodeSpec("frame_source", parameters)
     image_topic = values["image_topic"]
     nodes = chain(source, queue_policy="drop_oldest", image_topic=image_topic, **_common(values))
-    return _respawning(nodes, values)
+    return _respawning(_tracking(nodes, values), values)
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -274,6 +275,19 @@ def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
     return NodeSpec("monitor") if _truth(values, "monitor") else None
 
 
+def _tracking(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
+    """With the tracking that the argument asks for, where there is but one body to follow."""
+    if not _truth(values, "tracking") or values["bodies"]:
+        return nodes
+    tracking = {"tracking.enabled": True}
+    return [
+        replace(node, parameters={**node.parameters, **tracking})
+        if node.executable in ("localizer", "pipeline")
+        else node
+        for node in nodes
+    ]
+
+
 def _respawning(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
     respawn = _truth(values, "respawn")
     return [replace(node, respawn=respawn) for node in nodes]
@@ -317,6 +331,13 @@ _ARRANGEMENT = {
         "processes: one for each node; pipeline: source, localizer and pose in one, for the lowest latency",
     )
 }
+_TRACKING = {
+    "tracking": (
+        "true",
+        "Fit where the motion of the one body says that its particles will be, and search whole frames now and"
+        " then; false: search every frame. Of several bodies none is followed",
+    )
+}
 _MONITOR = {"monitor": ("false", "true: show it live to browsers on this machine, see docs/monitor.md")}
 _RESPAWN = {"respawn": ("false", "true: start a node again, after a second, that has failed or was killed")}
 _CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
@@ -337,6 +358,7 @@ SYSTEMS = {
             "image_topic": (topics.IMAGE, "Topic of the images"),
             **_OUTPUT,
             **_ARRANGEMENT,
+            **_TRACKING,
             **_MONITOR,
             **_RESPAWN,
             **_CONFIG,

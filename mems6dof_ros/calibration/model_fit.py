@@ -48,8 +48,8 @@ _FIRST_SCATTER = np.diag(np.array([5e-9, 5e-9, *[0.02] * 4, *[5e-4] * 5]) ** 2)
 
 @dataclass(frozen=True)
 class BeadCurve:
-    """One bead through focus: field position ``x``, ``y`` (m), ``stage_z`` (n,) m, ``features`` (n, 6) in
-    the order of FEATURES with ``noise`` (n, 6, 6); dx, dy are here field coordinates of the fitted
+    """One bead through focus: field position ``x``, ``y`` (m), ``stage_z`` (n,) m, ``features`` (n, k) in
+    the order of FEATURES with ``noise`` (n, k, k); dx, dy are here field coordinates of the fitted
     image in m. ``stack``: index of its focus stack."""
 
     x: float
@@ -94,7 +94,7 @@ class ModelFit:
     """The fitted ``model`` with what tells how good it is.
 
     Per bead: ``sharpest`` (b,) m, stage position of sharpest image; ``own_height`` (b,) m, about
-    substrate and focus surface; ``defocus`` and held-out ``residual``: lists of (n,) m and (n, 6).
+    substrate and focus surface; ``defocus`` and held-out ``residual``: lists of (n,) m and (n, k).
     """
 
     model: OpticalModel
@@ -231,7 +231,7 @@ class _Alignment:
             start += len(inside)
 
     def covariance(self, bead: BeadCurve, u: Array, inside: NDArray[np.bool_]) -> Array:
-        """Fit noise and scatter of the planes ``inside`` at defocus ``u``: (n, 6, 6)."""
+        """Fit noise and scatter of the planes ``inside`` at defocus ``u``: (n, k, k)."""
         nodes, scatter = self.scatter
         nearest = np.clip(np.rint((u - nodes[0]) / (nodes[1] - nodes[0])), 0, len(nodes) - 1).astype(np.intp)
         return bead.noise[inside] + scatter[nearest[inside]]
@@ -370,7 +370,7 @@ def _best(validation: CrossValidation) -> Orders:
 
 
 def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Array:
-    """Covariance (g, 6, 6) of the beads about the curves near each node, fit noise taken off."""
+    """Covariance (g, k, k) of the beads about the curves near each node, fit noise taken off."""
     u = np.concatenate([sample.argument for sample in alignment.samples()])
     r = np.concatenate(residual)
     noise = np.concatenate(alignment.noise())

@@ -108,7 +108,6 @@ def features(
 ) -> tuple[Array, Array]:
     """FEATURES (n, k) and their covariance (n, k, k) from ``fits``; NaN for the moments without them.
 
-
     dx and dy are here the fitted positions in m (of px 0). ``log_reference`` (n,): ln of the reference
     amplitude over flux, in px^-2; with A = flux / (2 pi sigma_x sigma_y sqrt(1 - rho^2)) the paper's
     rho_amp = rho A(rho*) / A becomes 2 pi exp(log_reference) sigma_x sigma_y rho sqrt(1 - rho^2).

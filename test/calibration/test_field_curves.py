@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mems6dof_ros.calibration.field_curves import BeadSamples, FieldCurves, FieldRegression
+from mems6dof_ros.calibration.model_fit import _positive
 from mems6dof_ros.calibration.zernike import zernike, zernike_count, zernike_order
 
 
@@ -43,3 +44,11 @@ def test_slopes_are_the_derivative():
     u, step = np.array([0.7e-6]), 1e-10
     numeric = (curves.values(local, u + step) - curves.values(local, u - step)) / (2 * step)
     np.testing.assert_allclose(curves.slopes(local, u), numeric, rtol=1e-4)
+
+
+def test_a_feature_without_scatter_does_not_inflate_that_of_others():
+    """What is left of its variance after noise may be nothing, its covariance with others not."""
+    excess = np.array([[1.0, 0.05], [0.05, -1e-6]])
+    found = _positive(excess, np.array([1.2, 0.5]))
+    assert np.linalg.eigvalsh(found).min() > 0
+    assert np.diag(found) == pytest.approx([1.0, 0.0], abs=0.01)

@@ -48,9 +48,7 @@ def run(args: argparse.Namespace) -> int:
             from mems6dof_ros.monitor.validation import PARTS as measured
 
             with tempfile.TemporaryDirectory(prefix="mems6dof_monitor_") as work:
-                rows = []
-                for row in measured[part](Path(work), _tell, quick=args.quick, seconds=args.seconds):
-                    rows.append(row)
+                rows = [*measured[part](Path(work), _tell, quick=args.quick, seconds=args.seconds)]
         print_table(rows)
         table += rows
     print()

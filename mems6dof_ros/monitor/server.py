@@ -46,8 +46,8 @@ from mems6dof_ros.monitor.picture import Picture
 MAX_PAGES = 8
 MAX_MESSAGE = 4096
 MAX_MESSAGES_PER_SECOND = 50
-#: Between two batches to a page, s: faster than the eye, slower than the cycles.
-_TICK = 0.04
+#: Between two batches to a page, s: as often as it draws, slower than the cycles.
+_TICK = 0.1
 _ROWS_PER_BATCH = 2000
 _SEND_TIMEOUT = 10.0
 #: Bytes that the kernel may hold for a page: on a slow line, more of them would be seconds of the past.

@@ -50,7 +50,7 @@ PARAMETERS = (
     Parameter("tls_certificate", "", "PEM file; with it and tls_key, the page is served by https."),
     Parameter("tls_key", "", "PEM file of its private key, without a password."),
     Parameter(
-        "picture_rate", 4.0, "Micrographs shown per second while a page is open; 0: none.", "Hz", (0.0, 30.0)
+        "picture_rate", 2.0, "Micrographs shown per second while a page is open; 0: none.", "Hz", (0.0, 30.0)
     ),
     Parameter(
         "viz_scale",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from monitor_helpers import Instrument
 
-from mems6dof_ros.monitor.validation import foxglove_messages
+from mems6dof_ros.monitor.validation.foxglove import foxglove_messages
 from mems6dof_ros.nodes.recorder import KNOWN_TYPES
 from mems6dof_ros.recording.definitions import typestore
 

@@ -26,7 +26,7 @@ from mems6dof_ros.monitor.attacks import ATTACKS
 from mems6dof_ros.monitor.history import COLUMNS
 from mems6dof_ros.monitor.picture import make_picture
 from mems6dof_ros.monitor.server import MAX_MESSAGE, MAX_MESSAGES_PER_SECOND, MAX_PAGES
-from mems6dof_ros.monitor.validation import attacked
+from mems6dof_ros.monitor.validation.attacked import attacked
 from mems6dof_ros.pose.cycle_pose import CyclePose
 
 CYCLE = list(COLUMNS).index("cycle")

@@ -7,12 +7,12 @@ import json
 import pytest
 
 from mems6dof_ros.cli.main import main
-from mems6dof_ros.monitor import validation
 from mems6dof_ros.monitor.attacks import other_host, other_paths
+from mems6dof_ros.monitor.validation import attacked
 
 
 def test_figures_are_printed_and_written_and_decide(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(validation, "ATTACKS", {"other host": other_host, "path traversal": other_paths})
+    monkeypatch.setattr(attacked, "ATTACKS", {"other host": other_host, "path traversal": other_paths})
     path = tmp_path / "figures.json"
     assert main(["validate", "monitor", "--only", "attacks", "--json", str(path)]) == 0
     printed = capsys.readouterr().out
@@ -23,7 +23,7 @@ def test_figures_are_printed_and_written_and_decide(capsys, tmp_path, monkeypatc
     async def succeeds(url: str) -> bool:
         return False
 
-    monkeypatch.setattr(validation, "ATTACKS", {"one that succeeds": succeeds})
+    monkeypatch.setattr(attacked, "ATTACKS", {"one that succeeds": succeeds})
     assert main(["validate", "monitor", "--only", "attacks"]) == 1
     assert "FAIL" in capsys.readouterr().out
 

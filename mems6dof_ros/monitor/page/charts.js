@@ -98,14 +98,19 @@ export class CycleChart {
     }
     this.onZoom = onZoom;
     this.onFollow = onFollow;
+    this.measure();
     this.build();
     new ResizeObserver(() => {
-      this.plot.setSize(this.size());
+      this.measure();
+      this.plot.setSize(this.size);
       this.draw();
     }).observe(this.plotNode);
   }
 
-  size() { return { width: Math.max(this.plotNode.clientWidth, 50), height: Math.max(this.plotNode.clientHeight, 40) }; }
+  // Kept, because to ask for it while drawing would lay out the page anew each time.
+  measure() {
+    this.size = { width: Math.max(this.plotNode.clientWidth, 50), height: Math.max(this.plotNode.clientHeight, 40) };
+  }
 
   // Made anew where colours change: uPlot keeps them.
   build() {
@@ -115,7 +120,7 @@ export class CycleChart {
       ticks: { stroke: colour("grid"), width: 1, size: 4 }, gap: 3 };
     const size = Math.round(parseFloat(font().split(" ")[1]) * 1.9);
     this.plot = new uPlot({
-      ...this.size(),
+      ...this.size,
       legend: { show: false },
       padding: [6, 16, 0, 0],
       cursor: {
@@ -171,15 +176,15 @@ export class CycleChart {
     const { history, low, high } = this.view;
     if (!history) return;
     const [start, stop] = history.range(low - 1, high + 1);
-    this.data = reduce(history, this.key, start, stop, this.size().width, this.trend(start, stop));
+    this.data = reduce(history, this.key, start, stop, this.size.width, this.trend(start, stop));
     this.findRange();
     this.plot.batch(() => {
       this.plot.setData([this.data.x, this.data.truth, this.data.y], false);
       this.plot.setScale("x", { min: low, max: Math.max(high, low + 1) });
     });
     this.drawn++;
-    const empty = this.data.y.every((y) => y === null);
-    this.plotNode.dataset.empty = empty ? "no valid pose in these cycles" : "";
+    const empty = this.data.y.every((y) => y === null) ? "no valid pose in these cycles" : "";
+    if (this.plotNode.dataset.empty !== empty) this.plotNode.dataset.empty = empty;
     this.readOut();
     if (this.legend) {
       const { aligned } = this.view;

@@ -13,13 +13,17 @@ export class PathMap {
     root.innerHTML = `<h2>${title} <small></small></h2><div class="stage"><canvas></canvas></div>`;
     this.noteNode = root.querySelector("small");
     this.canvas = root.querySelector("canvas");
-    new ResizeObserver(() => this.draw()).observe(root.querySelector(".stage"));
+    new ResizeObserver(() => {
+      // Kept, because to ask for it while drawing would lay out the page anew each time.
+      this.size = [this.canvas.clientWidth, this.canvas.clientHeight];
+      this.draw();
+    }).observe(root.querySelector(".stage"));
   }
 
   draw() {
     const { history, low, high } = this.view;
     const ratio = devicePixelRatio, canvas = this.canvas;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const [width, height] = this.size ?? [0, 0];
     if (!width || !height) return;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       canvas.width = Math.round(width * ratio);

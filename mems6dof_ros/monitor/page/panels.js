@@ -5,7 +5,7 @@ import { QUANTITIES, STATUS, number } from "./quantities.js";
 export const $ = (id) => document.getElementById(id);
 
 const STALE_S = 1.5;
-const MAX_LINES = 200;
+const LOG_LINES = 200;
 const STAGES = {
   latency_capture: "capture",
   latency_frame_transport: "frame transport",
@@ -172,14 +172,24 @@ export function showDiagnostics(diagnostics) {
   $("diagnostics").replaceChildren(...nodes);
 }
 
+// All the lines that the log will ever have, empty ones hidden: a page that stays open does not grow.
+export function clearEvents() {
+  $("events").replaceChildren(...Array.from({ length: LOG_LINES }, () => {
+    const line = element("li", "");
+    line.hidden = true;
+    line.append(element("time", "", " "), element("span", "dot"), element("span", "", " "));
+    return line;
+  }));
+}
+
 export function addEvents(events) {
   const list = $("events");
-  for (const { time, level, text: line } of events) {
-    const node = element("li", "");
-    node.dataset.level = level;
-    node.append(element("time", "", new Date(time * 1000).toLocaleTimeString("en-GB")), element("span", "dot"),
-      element("span", "", line));
-    list.prepend(node);
+  for (const { time, level, text: words } of events) {
+    const line = list.lastChild;
+    line.hidden = false;
+    line.dataset.level = level;
+    line.children[0].textContent = new Date(time * 1000).toLocaleTimeString("en-GB");
+    line.children[2].textContent = words;
+    list.prepend(line);
   }
-  while (list.childElementCount > MAX_LINES) list.lastChild.remove();
 }

@@ -1,0 +1,69 @@
+"""Nodes of a validation, each a process of its own, and what it costs."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.nodes.system import NodeSpec, run_system
+
+#: Cycles per second of the drive.
+DRIVE = 90.0
+_START = 30.0  # s that a node may take to serve
+
+
+def namespace() -> str:
+    """One that no other validation uses."""
+    return f"validate_{os.getpid()}"
+
+
+@contextlib.contextmanager
+def monitor(namespace: str) -> Iterator[tuple[str, int]]:
+    """A monitor node: the address of its page, its process id."""
+    with node(NodeSpec("monitor", {"port": 0}), namespace, "live page: ") as found:
+        yield found
+
+
+@contextlib.contextmanager
+def node(spec: NodeSpec, namespace: str, says: str = "") -> Iterator[tuple[str, int]]:
+    """A node as a process, once it has said so: what came after it on that line, and its process id."""
+    said: list[str] = []
+    lines: list[str] = []
+
+    def on_line(line: str) -> None:
+        lines.append(line)
+        if says in line:
+            said.append(line.partition(says)[2])
+
+    with run_system([spec], namespace=namespace, on_line=on_line) as running:
+        deadline = time.monotonic() + _START
+        while says and not said:
+            if running.poll() or time.monotonic() > deadline:
+                raise Mems6dofError(f"{spec.executable} does not start: {'; '.join(lines[-3:])}")
+            time.sleep(0.02)
+        yield said[0] if says else "", running.processes[spec.executable].pid
+
+
+def synthetic(namespace: str, **parameters: Any) -> contextlib.AbstractContextManager[tuple[str, int]]:
+    """The traffic of an instrument, as a node."""
+    return node(NodeSpec("synthetic_gear", parameters), namespace, "active")
+
+
+def processor_seconds(pid: int) -> float:
+    """That a process has used so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def memory(pid: int) -> float:
+    """Resident memory that is not a file's, MB."""
+    for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith("RssAnon:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    return math.nan

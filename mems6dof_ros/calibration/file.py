@@ -137,6 +137,7 @@ class Calibration:
             found = (self._by_shape if moments is None else self._by_all_features).locate(fits, moments)
             if self.method == "rho_amp":
                 found = _guarded(self._by_amplitude.locate(fits), found)
+        fits = fits if found.fits is None else found.fits
         x, y = field_position(fits.parameters, self.pixel_size, self.image_size)
         with np.errstate(invalid="ignore"):
             outside = _outside(x, self.valid.x) | _outside(y, self.valid.y)

@@ -13,17 +13,19 @@ from mems6dof_ros.localization.localizations import GaussianFits
 
 @dataclass(frozen=True)
 class Positions:
-    """Three-dimensional positions of n fitted particles.
+    """Three-dimensional positions of n particles.
 
     ``position`` (n, 3) m in the microscope frame, ``covariance`` (n, 3, 3) m^2, ``z_gap`` (n,)
     chi-square by which the second-best z is worse (NaN without a second candidate), ``flags`` (n,)
-    of Flag to add to those of the fits.
+    of Flag to add to those of the fits. ``fits``: of length n, where they are no longer those given because
+    one turned out to be of two particles, or what was flagged in them has been resolved; None: those given.
     """
 
     position: NDArray[np.float64]
     covariance: NDArray[np.float64]
     z_gap: NDArray[np.float64]
     flags: NDArray[np.uint32]
+    fits: GaussianFits | None = None
 
 
 class OpticalCalibration(Protocol):

@@ -7,9 +7,10 @@ the shape of its Gaussian fit places it, from both places where there are two.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -21,6 +22,7 @@ from mems6dof_ros.calibration.interface import Positions
 from mems6dof_ros.calibration.moments import Moments
 from mems6dof_ros.calibration.psf_likelihood import MARGIN, maximise
 from mems6dof_ros.calibration.psf_model import MARGIN_PX, PsfModel
+from mems6dof_ros.calibration.psf_neighbours import MOST, REACH, groups, maximise_together, two_places
 from mems6dof_ros.calibration.psf_pupil import PUPIL_TERMS, PupilImages
 from mems6dof_ros.calibration.zernike import zernike, zernike_count, zernike_order
 from mems6dof_ros.localization.camera import CameraNoise
@@ -35,6 +37,8 @@ MOST_MODES, LEAST_MODE = 4, 0.1
 _SECOND = 60.0
 #: Misfit in units of the calibration beads' that makes a fit poor, and rms residual of no concern.
 _POOR, _LEAST_POOR = 4.0, 0.03
+#: Of several particles fitted together, the light of the faintest over that of the brightest, at least.
+LEAST_LIGHT = 0.02
 _MOST_ORDER, _DEGREE = 5, 26
 _BACKGROUND = 10.0  # electrons per pixel, for weights only
 _SAMPLE = 800
@@ -50,6 +54,29 @@ class _One(NamedTuple):
     @property
     def deviance(self) -> float:
         return float(self.quality[0])
+
+
+class _Start(NamedTuple):
+    """Where fits of n particles begin: ``starts`` (n, 3), ``slopes`` (n, 2) and ``curves`` as for the
+    likelihood, ``focus`` (n,) m; and room for their ``parameters``."""
+
+    starts: Array
+    slopes: Array
+    curves: Array
+    focus: Array
+    parameters: Array
+
+
+class _Joint(NamedTuple):
+    """Particles fitted together: ``of`` (g,): the Gaussian fit that each was in, ``position`` (g, 3) m,
+    ``covariance``, ``flags``, the places ``seen`` (g, 2) px and ``light`` (g,) electrons."""
+
+    of: NDArray[np.int64]
+    position: Array
+    covariance: Array
+    flags: NDArray[np.uint32]
+    seen: Array
+    light: Array
 
 
 @dataclass(frozen=True)
@@ -80,6 +107,7 @@ class PsfEstimator:
         self._model, self._shape, self._camera, self._window_px = model, shape, camera, window_px
         self._z_range, self._pixel_size, self._image_size = z_range, pixel_size, image_size
         self._field = field
+        self._centre_px = (np.array(image_size) - 1) / 2
 
     @cached_property
     def components(self) -> Components:
@@ -108,43 +136,124 @@ class PsfEstimator:
                 spread = second.covariance + np.outer(offset, offset)
                 best[1][i] = (1 - weight) * first.covariance + weight * spread
         position, covariance, quality = best
-        return Positions(
-            position, covariance, z_gap, self._flags(position, covariance, quality, z_gap, fits.flux)
-        )
+        flags = self._flags(position, covariance, quality, z_gap, fits.flux)
+        return self._with_neighbours(fits, image, Positions(position, covariance, z_gap, flags))
 
     def _fit(self, image: NDArray[np.generic], places_px: Array, z: Array) -> tuple[Array, Array, Array]:
         """Positions (n, 3) m, covariances and quality of the fits that start at ``z`` (n,) m."""
-        model, components = self._model, self.components
-        centre = (np.array(self._image_size) - 1) / 2
-        pixel = self._pixel_size
-        place = (places_px - centre) * pixel
+        start = self._start(places_px, z)
+        n = len(z)
+        parameters, covariance, quality = start.parameters, np.empty((n, 3, 3)), np.empty((n, 4))
+        maximise(*self._arguments(image, start), parameters, covariance, quality)
+        return *self._in_metres(start, covariance), quality
+
+    def _start(self, places_px: Array, z: Array) -> _Start:
+        """Where fits of particles seen at ``places_px`` (n, 2) begin that are taken to be at ``z`` (n,) m."""
+        model, components, pixel = self._model, self.components, self._pixel_size
+        place = (places_px - self._centre_px) * pixel
         focus = model.focus(*place.T)
         slope = model.at(*place.T)[1]
         u = z - focus
         starts = np.column_stack([places_px - slope * u[:, None] / pixel, u])
-        k = len(components.images)
-        curves = components.curves.local(*place.T).reshape(len(z), 1 + components.modes, k, -1)
-        parameters = np.empty((len(z), 5 + components.modes))
-        covariance, quality = np.empty((len(z), 3, 3)), np.empty((len(z), 4))
-        maximise(
-            pixels(image),
-            *self._camera.maps,
-            self._window_px,
-            starts,
-            slope / pixel,
-            components.images,
-            np.ascontiguousarray(curves),
-            np.array(components.curves.interval),
-            model.pixel_misfit,
-            parameters,
-            covariance,
-            quality,
+        curves = components.curves.local(*place.T).reshape(
+            len(z), 1 + components.modes, len(components.images), -1
         )
-        position = np.column_stack([(parameters[:, :2] - centre) * pixel, parameters[:, 2] + focus])
+        parameters = np.empty((len(z), 5 + components.modes))
+        return _Start(starts, slope / pixel, np.ascontiguousarray(curves), focus, parameters)
+
+    def _arguments(self, image: NDArray[np.generic], start: _Start) -> tuple[Any, ...]:
+        """What both likelihoods want to know."""
+        return (
+            pixels(image), *self._camera.maps, self._window_px, start.starts, start.slopes,
+            self.components.images, start.curves, np.array(self.components.curves.interval),
+            self._model.pixel_misfit,
+        )  # fmt: skip
+
+    def _in_metres(self, start: _Start, covariance: Array) -> tuple[Array, Array]:
+        """Positions and covariances of fits in px and m of defocus."""
+        pixel, parameters = self._pixel_size, start.parameters
+        position = np.column_stack(
+            [(parameters[:, :2] - self._centre_px) * pixel, parameters[:, 2] + start.focus]
+        )
         scale = np.array([pixel, pixel, 1.0])
-        covariance *= scale[:, None] * scale
-        covariance[:, 2, 2] += model.focus_variance
-        return position, covariance, quality
+        covariance = covariance * scale[:, None] * scale
+        covariance[:, 2, 2] += self._model.focus_variance
+        return position, covariance
+
+    # ------------------------------------------------------------------------ neighbours
+
+    def _with_neighbours(self, fits: GaussianFits, image: NDArray[np.generic], found: Positions) -> Positions:
+        """``found`` with particles in each other's light fitted together, and with two positions for what one
+        Gaussian was fitted to where the pixels show two particles."""
+        unclear = (found.flags & (Flag.POOR_FIT | Flag.NO_Z)) != 0
+        clear = found.position[~unclear, 2]
+        # All particles of a body are at about one height: where a fit alone is of no use, that is the start.
+        usual = float(np.median(clear)) if len(clear) else 0.5 * sum(self._z_range)
+        z = np.where(unclear, usual, found.position[:, 2])
+        places = fits.parameters[:, :2]
+        sharing = groups(places, self._window_px)
+        grouped = np.concatenate([*sharing, np.empty(0, np.int64)])
+        alone = np.setdiff1d(np.flatnonzero(unclear & np.isfinite(places).all(axis=1)), grouped)
+        joints = []
+        for members in [*sharing, *alone[:, None]]:
+            if len(members) > MOST:
+                continue
+            if len(members) > 1 and (fit := self._together(image, members, places[members], z[members])):
+                joints.append(fit)
+                continue
+            for blob in members[unclear[members]] if len(members) < MOST else ():
+                others = members[members != blob]
+                two = self._two_places(image, fits, int(blob), usual)
+                if two is None:
+                    continue
+                of = np.r_[blob, blob, others]
+                heights = np.r_[usual, usual, z[others]]
+                if fit := self._together(image, of, np.concatenate([two, places[others]]), heights):
+                    joints.append(fit)
+                    break
+        return _replaced(fits, found, joints) if joints else found
+
+    def _together(
+        self, image: NDArray[np.generic], of: NDArray[np.int64], places_px: Array, z: Array
+    ) -> _Joint | None:
+        """Joint fit of particles seen at ``places_px`` (g, 2), taken to be at ``z`` (g,) m; None where that
+        does not explain the pixels."""
+        start, g = self._start(places_px, z), len(z)
+        covariance, quality = np.empty((g, 3, 3)), np.empty((g, 4))
+        if not maximise_together(*self._arguments(image, start), start.parameters, covariance, quality):
+            return None
+        light = start.parameters[:, 3]
+        position, covariance = self._in_metres(start, covariance)
+        flags = self._flags(position, covariance, quality, np.full(g, np.inf), np.full(g, light.sum()))
+        if (flags & (Flag.POOR_FIT | Flag.NO_Z)).any() or light.min() < LEAST_LIGHT * light.max():
+            return None
+        seen = start.parameters[:, :2] + start.slopes * start.parameters[:, 2:3]
+        return _Joint(of, position, covariance, flags, seen, light)
+
+    def _two_places(
+        self, image: NDArray[np.generic], fits: GaussianFits, blob: int, z: float
+    ) -> Array | None:
+        """Two places (2, 2) px that explain what the Gaussian ``blob`` was fitted to, for heights of ``z`` m;
+        None where there are none, or the image's edge is too near."""
+        model, components, window = self._model, self.components, self._window_px
+        start = self._start(fits.parameters[blob : blob + 1, :2], np.array([z]))
+        low, high = components.curves.interval
+        s = np.clip((2 * start.starts[0, 2] - low - high) / (high - low), -1, 1)
+        amplitudes = chebyshev.chebval(s, start.curves[0, 0].T)
+        margin = (components.images.shape[1] - window) // 2
+        unit = np.tensordot(amplitudes, components.images, 1)[margin:-margin, margin:-margin]
+        column, row = (round(v) for v in fits.parameters[blob, :2])
+        half = window // 2 + REACH
+        part = np.s_[row - half : row + half + 1, column - half : column + half + 1]
+        size = 2 * half + 1
+        if min(row, column) < half or image[part].shape != (size, size):
+            return None
+        offset, gain, _ = (v[part] if v.size > 1 else v for v in self._camera.maps)
+        electrons = (image[part].astype(float) - offset) / gain
+        places = two_places(
+            electrons - np.percentile(electrons, 20), unit, 0.8 * model.imaging.diameter / self._pixel_size
+        )
+        return None if places is None else places + np.array([column, row])
 
     def _flags(
         self, position: Array, covariance: Array, quality: Array, z_gap: Array, flux: Array
@@ -163,6 +272,31 @@ class PsfEstimator:
             flags = np.where(z_gap < AMBIGUITY_GAP, Flag.Z_AMBIGUOUS, 0)
         flags |= np.where(beyond, Flag.Z_OUT_OF_RANGE, 0) | np.where(poor, Flag.POOR_FIT, 0)
         return np.asarray(flags | np.where(failed, Flag.NO_Z, 0), dtype=np.uint32)
+
+
+def _replaced(fits: GaussianFits, found: Positions, joints: Sequence[_Joint]) -> Positions:
+    """``found`` with the particles of ``joints`` in place of what their Gaussian fits gave. Of two that were
+    in one, the second is appended; they share its shape and its light."""
+    of, rows, share = list(range(len(fits))), [], []
+    for joint in joints:
+        share.append(joint.light / np.bincount(joint.of, joint.light)[joint.of])
+        for number, row in enumerate(joint.of.tolist()):
+            if row in joint.of[:number]:
+                of.append(row)
+                row = len(of) - 1
+            rows.append(row)
+    fits = fits[np.array(of)]
+    position, covariance, flags = found.position[of], found.covariance[of], found.flags[of]
+    position[rows] = np.concatenate([joint.position for joint in joints])
+    covariance[rows] = np.concatenate([joint.covariance for joint in joints])
+    flags[rows] = np.concatenate([joint.flags for joint in joints])
+    z_gap = found.z_gap[of]
+    z_gap[rows] = np.nan
+    fits.parameters[rows, :2] = np.concatenate([joint.seen for joint in joints])
+    fits.parameters[rows, 2] *= np.concatenate(share)
+    # What was said against the Gaussians is explained.
+    fits.flags[rows] &= ~np.uint32(Flag.NEIGHBOUR | Flag.POOR_FIT)
+    return Positions(position, covariance, z_gap, flags, fits)
 
 
 def compress(

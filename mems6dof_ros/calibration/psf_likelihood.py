@@ -83,7 +83,7 @@ def _moved(source: Array, size: int, window: int, first: int, taps: Array, rows:
 
 
 @njit(forceinline=True, **_OPTIONS)
-def _solve(matrix: Array, right: Array, solution: Array, inverse: Array) -> bool:
+def solve(matrix: Array, right: Array, solution: Array, inverse: Array) -> bool:
     """Solve by Cholesky with unit diagonal; also the inverse. False where singular."""
     n = len(right)
     scale = np.empty(n)
@@ -125,6 +125,61 @@ def _solve(matrix: Array, right: Array, solution: Array, inverse: Array) -> bool
     return True
 
 
+@njit(forceinline=True, **_OPTIONS)
+def render(
+    x: float, y: float, u: float, own: Array, slope: Array, curves: Array, low: float, high: float,
+    flat: Array, amplitude: Array, source: Array, rows: Array, tangent: Array,
+) -> bool:  # fmt: skip
+    """The image of unit light of a particle at ``x``, ``y`` px from the middle pixel and defocus ``u`` m,
+    with departures ``own`` (m,), into ``tangent[3]``, its derivatives by x, y, u into ``tangent[:3]`` and by
+    the modes into ``tangent[5:]``; ``curves`` (1 + m, k, d), ``flat`` (k, pixels of the components), the rest
+    is scratch. False where it lies too far off."""
+    groups, k_count, degree = curves.shape
+    size, window = source.shape[1], tangent.shape[1]
+    chebyshev, slope_chebyshev = np.empty(degree), np.empty(degree)
+    tx, ty, sx, sy = np.empty(TAPS), np.empty(TAPS), np.empty(TAPS), np.empty(TAPS)
+    shift_x = x + slope[0] * u
+    shift_y = y + slope[1] * u
+    if not (abs(shift_x) < _FARTHEST and abs(shift_y) < _FARTHEST):
+        return False
+    s = (2 * u - (low + high)) / (high - low)
+    chebyshev[0], slope_chebyshev[0] = 1.0, 0.0
+    chebyshev[1], slope_chebyshev[1] = s, 1.0
+    for d in range(2, degree):
+        chebyshev[d] = 2 * s * chebyshev[d - 1] - chebyshev[d - 2]
+        slope_chebyshev[d] = 2 * chebyshev[d - 1] + 2 * s * slope_chebyshev[d - 1] - slope_chebyshev[d - 2]
+    amplitude[:] = 0.0
+    for k in range(k_count):
+        for m in range(groups):
+            a = 0.0
+            b = 0.0
+            for d in range(degree):
+                a += curves[m, k, d] * chebyshev[d]
+                b += curves[m, k, d] * slope_chebyshev[d]
+            b *= 2 / (high - low)
+            n_m = 1.0 if m == 0 else own[m - 1]
+            amplitude[0, k] += n_m * a
+            amplitude[1, k] += n_m * b
+            if m > 0:
+                amplitude[1 + m, k] = a
+    for g in range(groups + 1):
+        line = source[g].reshape(size * size)
+        line[:] = 0.0
+        for k in range(k_count):
+            a = amplitude[g, k]
+            component = flat[k]
+            for p in range(size * size):
+                line[p] += a * component[p]
+    first, at = _taps(shift_x, tx, sx), _taps(shift_y, ty, sy)
+    _moved(source[0], size, window, first, sx, rows, tangent[0], at, ty)
+    _moved(source[0], size, window, first, tx, rows, tangent[1], at, sy)
+    _moved(source[1], size, window, first, tx, rows, tangent[2], at, ty)
+    _moved(source[0], size, window, first, tx, rows, tangent[3], at, ty)
+    for m in range(1, groups):
+        _moved(source[1 + m], size, window, first, tx, rows, tangent[4 + m], at, ty)
+    return True
+
+
 @njit(**_OPTIONS)
 def maximise(
     image: NDArray[np.generic],
@@ -152,7 +207,7 @@ def maximise(
     fails; ``covariance`` (n, 3, 3) of the first three; ``quality`` (n, 4): deviance with the modes' prior,
     Pearson's chi-square, number of pixels, sum of mu_s^2 / mu.
     """
-    count, groups, k_count, degree = curves.shape
+    count, groups, k_count, _ = curves.shape
     modes = groups - 1
     size = components.shape[1]
     n_par = 5 + modes
@@ -167,8 +222,6 @@ def maximise(
     rows = np.empty((size, window))
     # Derivatives by column, row, defocus, light, background (one), modes.
     tangent = np.empty((n_par, window, window))
-    chebyshev, slope_chebyshev = np.empty(degree), np.empty(degree)
-    tx, ty, sx, sy = np.empty(TAPS), np.empty(TAPS), np.empty(TAPS), np.empty(TAPS)
     normal, inverse = np.empty((n_par, n_par)), np.empty((n_par, n_par))
     gradient, step, theta, last = np.empty(n_par), np.empty(n_par), np.empty(n_par), np.empty(n_par)
     mean = np.empty((window, window))
@@ -207,48 +260,11 @@ def maximise(
         done = False
         expected = 0.0
         for iteration in range(_ITERATIONS):
-            # Amplitudes at this defocus.
-            s = (2 * theta[2] - (low + high)) / (high - low)
-            chebyshev[0], slope_chebyshev[0] = 1.0, 0.0
-            chebyshev[1], slope_chebyshev[1] = s, 1.0
-            for d in range(2, degree):
-                chebyshev[d] = 2 * s * chebyshev[d - 1] - chebyshev[d - 2]
-                slope_chebyshev[d] = (
-                    2 * chebyshev[d - 1] + 2 * s * slope_chebyshev[d - 1] - slope_chebyshev[d - 2]
-                )
-            amplitude[:] = 0.0
-            for k in range(k_count):
-                for m in range(groups):
-                    a = 0.0
-                    b = 0.0
-                    for d in range(degree):
-                        a += curves[i, m, k, d] * chebyshev[d]
-                        b += curves[i, m, k, d] * slope_chebyshev[d]
-                    b *= 2 / (high - low)
-                    n_m = 1.0 if m == 0 else theta[4 + m]
-                    amplitude[0, k] += n_m * a
-                    amplitude[1, k] += n_m * b
-                    if m > 0:
-                        amplitude[1 + m, k] = a
-            for g in range(groups + 1):
-                line = source[g].reshape(size * size)
-                line[:] = 0.0
-                for k in range(k_count):
-                    a = amplitude[g, k]
-                    component = flat[k]
-                    for p in range(size * size):
-                        line[p] += a * component[p]
-            shift_x = theta[0] + slopes[i, 0] * theta[2]
-            shift_y = theta[1] + slopes[i, 1] * theta[2]
-            if not (abs(shift_x) < _FARTHEST and abs(shift_y) < _FARTHEST):
+            if not render(
+                theta[0], theta[1], theta[2], theta[5:], slopes[i], curves[i], low, high, flat, amplitude,
+                source, rows, tangent,
+            ):  # fmt: skip
                 break
-            first, at = _taps(shift_x, tx, sx), _taps(shift_y, ty, sy)
-            _moved(source[0], size, window, first, sx, rows, tangent[0], at, ty)
-            _moved(source[0], size, window, first, tx, rows, tangent[1], at, sy)
-            _moved(source[1], size, window, first, tx, rows, tangent[2], at, ty)
-            _moved(source[0], size, window, first, tx, rows, tangent[3], at, ty)
-            for m in range(modes):
-                _moved(source[2 + m], size, window, first, tx, rows, tangent[5 + m], at, ty)
             unit = tangent[3]
             if iteration == 0:
                 # First light and background by least squares.
@@ -316,7 +332,7 @@ def maximise(
             for m in range(modes):
                 normal[5 + m, 5 + m] += 1.0
                 gradient[5 + m] -= theta[5 + m]
-            if not _solve(normal, gradient, step, inverse):
+            if not solve(normal, gradient, step, inverse):
                 break
             expected = 0.0
             for p in range(n_par):

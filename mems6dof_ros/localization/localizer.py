@@ -85,6 +85,7 @@ class Localizer:
         fits.flags[:] |= self._quality_flags(fits, pixel_size)
         if self.calibration:
             found = self.calibration.locate(fits, frame.image)
+            fits = fits if found.fits is None else found.fits
         else:
             found = _lateral_positions(fits, pixel_size, frame.image.shape)
         return Localizations(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,7 +21,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from mems6dof_ros.pose.field import FieldError
 from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, rotation_z
-from mems6dof_ros.pose.solve import pose_jacobian
+from mems6dof_ros.pose.solve import pose_jacobian, weights
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -79,6 +80,8 @@ class Constellation:
         self._eliminated: list[Array] = []  # of every cycle since: what its pose took, see observe
         self._refined_at = 0
         self._latest = IDENTITY
+        self._centre: Array | None = None
+        self._joint = np.empty((0, 0))  # covariance of all positions, given the field error
         self._frames = np.zeros((2, 6, len(modes)))
 
     def __len__(self) -> int:
@@ -107,8 +110,19 @@ class Constellation:
                 self._information[first + a, first + b] += np.linalg.inv(covariance)[:, a, b]
         self.cycles = self._refined_at = 2  # as good as confirmed
 
-    def add(self, ids: Indices, position: Array, covariance: Array, coupling: Array) -> None:
-        """Add particles (n,) at ``position`` (n, 3) m, known to ``covariance`` until evidence comes in."""
+    def add(
+        self,
+        ids: Indices,
+        position: Array,
+        covariance: Array,
+        coupling: Array,
+        carried: tuple[Indices, Array] | None = None,
+    ) -> None:
+        """Add particles (n,) at ``position`` (n, 3) m, known to ``covariance`` until evidence comes in.
+
+        ``carried``: rows (s,) and (3 n, 3 s): how much of the errors of those positions is in the new ones,
+        which were measured from a pose that is theirs; ``covariance`` is that of the rest.
+        """
         n, old = len(ids), len(self._vector)
         if n == 0:
             return
@@ -128,6 +142,7 @@ class Constellation:
         information[new, new] = WEAK_PRIOR**-2
         self._information = information
         self._vector = np.r_[self._vector, np.zeros(3 * n)]
+        self._extend_joint(n, carried)
         near = self._has_neighbour()[-n:]
         prior = NOISE_PRIOR * np.where(near, OVERLAP_FACTOR, 1.0)
         self._squares = np.r_[self._squares, np.c_[prior, prior]]
@@ -148,18 +163,30 @@ class Constellation:
         self.cycles += 1
         self._latest = pose
 
-    def field_response(self, rows: Indices, pose: RigidPose, modes: Array) -> tuple[Array, Array]:
-        """How the field error moves ``rows`` (n,) against their predicted places at ``pose``: (n, 3, k) m for
-        modes of unit variance, and their covariance (n, 3, 3) m^2 in each.
+    def relative(self, rows: Indices, pose: RigidPose, noise: Array, has_z: Mask, modes: Array) -> Relative:
+        """What is uncertain of ``rows`` (n,) against each other, at ``pose``; ``noise`` (n, 3, 3) m^2 of
+        their localizations, whose z counts where ``has_z`` (n,); ``modes`` (n, 3, k) of the field there.
 
-        That is the directly seen ``modes``, less what the map has absorbed of them, less what is no error
-        of the motion but a constant of the frames (see ``_constant_response``).
+        How the field error moves them is the directly seen ``modes``, less what the map has absorbed of them,
+        less what is no error of the motion but a constant of the frames (see ``_constant_response``).
         """
         microscope, body = self._frames
         constant = microscope + (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
-        return _field_response(
-            rows, modes, self.coupling, pose.rotation, self.position, constant, self.field_factor
+        joint = _blocks(self._joint, rows)
+        own = pose.rotation @ self.covariance[rows] @ pose.rotation.T
+        weight = weights(noise + own, has_z)
+        response, spread, covariance = _relative(
+            rows,
+            modes,
+            self.coupling,
+            pose.rotation,
+            self.position,
+            constant,
+            self.field_factor,
+            weight,
+            joint,
         )
+        return Relative(response, spread, covariance, joint)
 
     def linearisation(self, rows: Indices) -> Array:
         """Fixed positions (n, 3) m that ``observe`` refers to."""
@@ -196,12 +223,16 @@ class Constellation:
         """True when enough evidence has come in to make ``refine`` worth its time."""
         return self.cycles - self._refined_at >= min(REFINE_AT_MOST, max(1, self.cycles // 8))
 
-    def refine(self) -> None:
+    def refine(self, centre: Array | None = None) -> None:
         """Solve for all positions and the field error: milliseconds, hence not in every cycle.
 
-        Where covariances contradict each other beyond what numbers can hold, the map stays as it is.
+        ``centre`` (2,) m: about which the body turns, in the microscope frame; None where that is not known
+        better than before. Where covariances contradict each other beyond what numbers can hold, the map
+        stays as it is.
         """
         self._refined_at = self.cycles
+        if centre is not None:
+            self._centre = centre
         self._settle()
         self._forget_retired()
         with suppress(np.linalg.LinAlgError):
@@ -210,6 +241,8 @@ class Constellation:
     def _solve(self) -> None:
         k, n = len(self.modes), len(self)
         information = self._information
+        if not (np.diag(information)[k:] > 0).all():
+            raise np.linalg.LinAlgError("the map's information is not positive definite")
         scale = np.r_[np.sqrt(np.diag(self.field.prior)), 1 / np.sqrt(np.diag(information)[k:])]
         vector = self._vector * scale
         # The lower triangle in rows is the upper one in columns, which LAPACK wants.
@@ -230,11 +263,11 @@ class Constellation:
         self.coupling = -(gain[:, :k] * scale[k:, None] / scale[:k]).reshape(n, 3, k)
         self.position = self._origin + correction.reshape(n, 3)
         inverse, _ = dpotri(factor, overwrite_c=1)
+        self._joint = _unscaled(inverse, scale[k:])
         first = 3 * np.arange(n)
         for a in range(3):
-            for b in range(a + 1):
-                block = inverse[first + b, first + a] * scale[k + first + a] * scale[k + first + b]
-                self.covariance[:, a, b] = self.covariance[:, b, a] = block
+            for b in range(3):
+                self.covariance[:, a, b] = self._joint[first + a, first + b]
         self._frames = self._constant_response()
 
     def _constant_response(self) -> Array:
@@ -242,8 +275,14 @@ class Constellation:
         the microscope frame and one of the body frame, by least squares.
 
         No rotating body can measure either, both are definitions, and neither may enter the covariance:
-        an unknown constant is not an error of motion.
+        an unknown constant is not an error of motion. The revolution is about the middle of the field,
+        which is right for a body that fills it and on the safe side for a smaller one. Of a body whose centre
+        is out of the field (a ring gear) only an arc is seen, over which no constant is told from a drift:
+        none is taken off.
         """
+        constants = np.zeros((2, 6, len(self.modes)))
+        if self._centre is not None and (np.abs(self._centre) > self.modes.half_size).any():
+            return constants
         around, responses = [], []
         for angle in np.arange(AROUND) * (math.tau / AROUND):
             pose = self._latest.then(RigidPose(rotation_z(angle), np.zeros(3)))
@@ -252,7 +291,6 @@ class Constellation:
             if len(seen) >= 8:
                 around.append(np.c_[np.eye(3), pose.rotation])
                 responses.append(self._response(pose, place, seen))
-        constants = np.zeros((2, 6, len(self.modes)))
         for part in (slice(0, 3), slice(3, 6)) if around else ():
             stacked = np.concatenate([response[part] for response in responses])
             solution = np.linalg.lstsq(np.concatenate(around), stacked, rcond=1e-3)[0]
@@ -290,16 +328,59 @@ class Constellation:
         gain = np.linalg.solve(full[np.ix_(out, out)], np.c_[cross, self._vector[out]])
         self._information = full[np.ix_(keep, keep)] - cross.T @ gain[:, :-1]
         self._vector = self._vector[keep] - cross.T @ gain[:, -1]
+        rows = np.flatnonzero(self.active)
+        self._joint = _blocks(self._joint, rows)
         for name in ("ids", "position", "covariance", "coupling", "sightings", "misses", "outliers"):
             setattr(self, name, getattr(self, name)[self.active])
         self._origin, self._squares = self._origin[self.active], self._squares[self.active]
         self._freedom = self._freedom[self.active]
         self.active = np.ones(len(self.ids), bool)
 
+    def _extend_joint(self, n: int, carried: tuple[Indices, Array] | None) -> None:
+        """Joint covariance of the latest ``n`` particles with all others, see ``add``."""
+        old, size = len(self._joint), 3 * len(self)
+        joint = np.zeros((size, size))
+        joint[:old, :old] = self._joint
+        first = old + 3 * np.arange(n)
+        for a in range(3):
+            for b in range(3):
+                joint[first + a, first + b] = self.covariance[-n:, a, b]
+        if carried is not None:
+            rows, share = carried
+            seen = (3 * rows[:, None] + np.arange(3)).ravel()
+            cross = share @ self._joint[seen]
+            joint[old:, :old], joint[:old, old:] = cross, cross.T
+            joint[old:, old:] += cross[:, seen] @ share.T
+            self.covariance[-n:] = joint[old:, old:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        self._joint = joint
+
     def _has_neighbour(self) -> Mask:
         distance = np.hypot(*(self.position[:, None, :2] - self.position[None, :, :2]).transpose(2, 0, 1))
         np.fill_diagonal(distance, np.inf)
         return distance.min(axis=1, initial=np.inf) < self.overlap
+
+
+class Relative(NamedTuple):
+    """The map as n particles in view have it, at one pose.
+
+    ``response`` (n, 3, k) m: how the field error moves them, for modes of unit variance. ``spread`` (n, 3, 3)
+    m^2, microscope axes, and ``covariance`` (n, 3, 3) m^2, body axes: of the field error and of their
+    positions, each less the motion that all of them share, which no residual shows. ``joint`` (3 n, 3 n) m^2,
+    body axes: all of their positions' covariance.
+    """
+
+    response: Array
+    spread: Array
+    covariance: Array
+    joint: Array
+
+    def of_pose(self, rotation: Array, gain: Array) -> Array:
+        """What the errors of the map add to the covariance of a pose of ``rotation`` (3, 3) beyond
+        ``covariance``, had it been independent: K (P - D) K^T with the ``gain`` K (6, 3 n)."""
+        gain = (gain.reshape(6, -1, 3) @ rotation).reshape(6, -1)
+        independent = gain.reshape(6, -1, 3).swapaxes(0, 1) @ self.covariance
+        both = independent.swapaxes(0, 1).reshape(6, -1) @ gain.T
+        return np.asarray(gain @ self.joint @ gain.T - both)
 
 
 class Candidates:
@@ -358,36 +439,106 @@ class Candidates:
             setattr(self, name, getattr(self, name)[mask])
 
 
+@njit(cache=True, nogil=True)
+def _unscaled(upper, scale):  # type: ignore[no-untyped-def]
+    """The symmetric matrix whose ``upper`` triangle (n, n), times ``scale`` (n,) on both sides, is given."""
+    n = len(scale)
+    out = np.empty((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            out[i, j] = out[j, i] = upper[i, j] * scale[i] * scale[j]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _blocks(joint, rows):  # type: ignore[no-untyped-def]
+    """The 3 x 3 blocks ``rows`` (n,) of a matrix, as one (3 n, 3 n)."""
+    n = len(rows)
+    out = np.empty((3 * n, 3 * n))
+    for i in range(n):
+        for a in range(3):
+            line, given = out[3 * i + a], joint[3 * rows[i] + a]
+            for j in range(n):
+                for b in range(3):
+                    line[3 * j + b] = given[3 * rows[j] + b]
+    return out
+
+
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def _field_response(rows, modes, coupling, rotation, position, constant, factor):  # type: ignore[no-untyped-def]
+def _relative(  # type: ignore[no-untyped-def]
+    rows, modes, coupling, rotation, position, constant, factor, weight, joint
+):
+    """See ``Constellation.relative``: with J = [1, -hat(R p)] and A = (J^T W J)^-1 J^T W, the motion A e that
+    errors e have in common is taken off: e - J A e."""
     n, k = len(rows), modes.shape[2]
-    lines, spread = np.empty((3 * n, k)), np.empty((n, 3, 3))
-    moved = np.empty(3)
+    lines, design, pull = np.empty((3 * n, k)), np.zeros((3 * n, 6)), np.empty((3 * n, 6))
     for i in range(n):
         p, g = position[rows[i]], coupling[rows[i]]
+        v = design[3 * i : 3 * i + 3]
+        x, y, z = (
+            rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2],
+            rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2],
+            rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2],
+        )
+        v[0, 0] = v[1, 1] = v[2, 2] = 1.0
+        v[0, 4], v[0, 5] = z, -y
+        v[1, 3], v[1, 5] = -z, x
+        v[2, 3], v[2, 4] = y, -x
         for a in range(3):
-            moved[a] = rotation[a, 0] * p[0] + rotation[a, 1] * p[1] + rotation[a, 2] * p[2]
-        for a in range(3):
-            # Row a of J = [1, -hat(R p)] has two entries beside the one.
+            # Row a of J has two entries beside the one.
             one, other = (4, 5) if a == 0 else ((3, 5) if a == 1 else (3, 4))
-            by_one = moved[2] if a == 0 else (-moved[2] if a == 1 else moved[1])
-            by_other = -moved[1] if a == 0 else (moved[0] if a == 1 else -moved[0])
             r0, r1, r2 = rotation[a, 0], rotation[a, 1], rotation[a, 2]
             line = lines[3 * i + a]
             for m in range(k):
                 line[m] = (
                     modes[i, a, m] + r0 * g[0, m] + r1 * g[1, m] + r2 * g[2, m]
-                    - constant[a, m] - by_one * constant[one, m] - by_other * constant[other, m]
+                    - constant[a, m] - v[a, one] * constant[one, m] - v[a, other] * constant[other, m]
                 )  # fmt: skip
-    out = np.dot(lines, factor).reshape(n, 3, k)
+            for c in range(6):
+                pull[3 * i + a, c] = (
+                    weight[i, a, 0] * v[0, c] + weight[i, a, 1] * v[1, c] + weight[i, a, 2] * v[2, c]
+                )
+    normal = np.dot(design.T, pull)
+    scale = np.empty(6)
+    for c in range(6):
+        scale[c] = 1 / math.sqrt(max(normal[c, c], 1e-300))
+    for c in range(6):
+        for b in range(6):
+            normal[c, b] *= scale[c] * scale[b]
+        normal[c, c] += LEAST_PIVOT
+    inverse = np.linalg.inv(normal)
+    for c in range(6):
+        for b in range(6):
+            inverse[c, b] *= scale[c] * scale[b]
+    share = np.dot(pull, inverse)  # A^T
+    response = np.dot(lines, factor)
+    apart = response - np.dot(design, np.dot(share.T, response))
+    # Into body axes, in which the joint covariance is.
+    turned, levers = np.empty((3 * n, 6)), np.empty((3 * n, 6))
+    for i in range(n):
+        for a in range(3):
+            for c in range(6):
+                s, t = 0.0, 0.0
+                for b in range(3):
+                    s += rotation[b, a] * share[3 * i + b, c]
+                    t += rotation[b, a] * design[3 * i + b, c]
+                turned[3 * i + a, c], levers[3 * i + a, c] = s, t
+    shared = np.dot(joint, turned)
+    common = np.dot(turned.T, shared)
+    by_lever = 0.5 * np.dot(levers, common) - shared
+    spread, covariance = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for i in range(n):
         for a in range(3):
             for b in range(a + 1):
-                total = 0.0
+                total, own = 0.0, joint[3 * i + a, 3 * i + b]
                 for m in range(k):
-                    total += out[i, a, m] * out[i, b, m]
+                    total += apart[3 * i + a, m] * apart[3 * i + b, m]
+                for c in range(6):
+                    own += by_lever[3 * i + a, c] * levers[3 * i + b, c]
+                    own += by_lever[3 * i + b, c] * levers[3 * i + a, c]
                 spread[i, a, b] = spread[i, b, a] = total
-    return out, spread
+                covariance[i, a, b] = covariance[i, b, a] = own
+    return response.reshape(n, 3, k), spread, covariance
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})

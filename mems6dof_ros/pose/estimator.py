@@ -229,11 +229,11 @@ class PoseEstimator:
         modes = constellation.modes.evaluate(seen.position)
         factor = constellation.noise_factor(rows) * (self._noise[0] / self._noise[1])
         noise = scaled(seen.covariance, factor)
-        response, spread = constellation.field_response(rows, start, modes)
+        relative = constellation.relative(rows, start, noise, seen.has_z, modes)
         solution = solve_pose(
-            start, constellation.position[rows], constellation.covariance[rows],
-            seen.position - modes @ constellation.field_mean, noise, seen.has_z, response, spread,
-            s.gate_xy, s.gate_z,
+            start, constellation.position[rows], relative.covariance,
+            seen.position - modes @ constellation.field_mean, noise, seen.has_z, relative.response,
+            relative.spread, s.gate_xy, s.gate_z,
         )  # fmt: skip
         used, used_z = int((solution.use > UNUSED).sum()), int((solution.use == FULL).sum())
         if not solution.ok or used < s.min_particles:
@@ -244,7 +244,8 @@ class PoseEstimator:
         if implausible:
             return self._lost(localizations, implausible)
 
-        chained, covariance = self._chained, solution.covariance
+        chained = self._chained
+        covariance = solution.covariance + relative.of_pose(solution.pose.rotation, solution.gain)
         if s.reference == "previous":
             chained = chained + _exchanged(constellation, solution, rows, self._in_solution)
             covariance = chained + solution.noise
@@ -409,22 +410,29 @@ class PoseEstimator:
         """Refine the map and its membership by one cycle; ``part`` (n,): localizations in the solution, with
         ``noise`` (n, 3, 3)."""
         rows, good = match[part], solution.use > UNUSED
-        weight = weights(noise[good], solution.use[good] == FULL)
-        offset = view.position[part[good]] - state.pose.apply(constellation.linearisation(rows[good]))
-        constellation.observe(rows[good], state.pose, offset, weight, modes[good])
         seen = match[match >= 0]
         missed = inside.copy()
         missed[seen] = False
         outlying = np.column_stack([~good, view.has_z[part] & (solution.use == LATERAL)])
         retired = constellation.count(seen, np.flatnonzero(missed), rows, outlying)
-        self._recruit(view.only((match < 0) & view.good & view.has_z), constellation, state)
+        newcomers = view.only((match < 0) & view.good & view.has_z)
+        joined, index = self._recruit(newcomers, constellation, state, rows, modes, solution)
+        newcomers = newcomers.only(index)
+        rows = np.r_[rows[good], joined]
+        position = np.r_[view.position[part[good]], newcomers.position]
+        weight = np.r_[weights(noise[good], solution.use[good] == FULL), np.linalg.inv(newcomers.covariance)]
+        modes = np.r_[modes[good], constellation.modes.evaluate(newcomers.position)]
+        offset = position - state.pose.apply(constellation.linearisation(rows))
+        constellation.observe(rows, state.pose, offset, weight, modes)
         if len(retired):
             self.candidates.add(
                 constellation.ids[retired], constellation.position[retired],
                 constellation.covariance[retired], former=True,
             )  # fmt: skip
         if constellation.due:
-            constellation.refine()
+            centre = self.centre.estimate()
+            known = centre is not None and centre.sd < CENTRE_KNOWN
+            constellation.refine(centre.microscope if centre and known else None)
 
     def _learn_noise(self, constellation: Constellation, rows: Indices, solution: Solution) -> None:
         """Compare the residuals with what the covariances claim, over all particles and for each."""
@@ -433,15 +441,21 @@ class PoseEstimator:
         self._noise += squares.sum(axis=0) * (self._noise[0] / self._noise[1]), freedom.sum(axis=0)
         self._noise /= np.maximum(1.0, self._noise[1] / NOISE_MEMORY)
 
-    def _recruit(self, newcomers: Usable, constellation: Constellation, state: State) -> None:
-        """Follow localizations of no known particle; what moves with the body joins the map."""
+    def _recruit(
+        self, newcomers: Usable, constellation: Constellation, state: State, rows: Indices, modes: Array,
+        solution: Solution,
+    ) -> tuple[Indices, Indices]:  # fmt: skip
+        """Follow localizations of no known particle; what moves with the body joins the map. The ``solution``
+        is by particles ``rows`` (n,) at ``modes`` (n, 3, k) of the field. Returns the rows (j,) of those that
+        joined, and which of the ``newcomers`` they are."""
         pose, candidates, gate = state.pose, self.candidates, self.settings.identity_gate
+        none = np.empty(0, np.int64)
         if not len(newcomers.of) and not len(candidates):
-            return
+            return none, none
         field = constellation.modes.evaluate(newcomers.position) @ constellation.field_mean
         place = pose.inverse().apply(newcomers.position - field)
         jacobian = pose_jacobian(place, pose.rotation)
-        covariance = newcomers.covariance + jacobian @ state.covariance @ jacobian.transpose(0, 2, 1)
+        covariance = newcomers.covariance + jacobian @ state.noise @ jacobian.transpose(0, 2, 1)
         covariance = pose.rotation.T @ covariance @ pose.rotation
         separation = _separation(place, candidates.position)
         again = np.flatnonzero(separation.min(axis=1, initial=np.inf) < gate)
@@ -452,14 +466,24 @@ class PoseEstimator:
         fresh = separation.min(axis=1, initial=np.inf) >= gate
         # No two spheres of a micrometre in one place.
         fresh &= _separation(place, known).min(axis=1, initial=np.inf) > 1e-6
+        ids, new = candidates.ids[seen], self._new_ids(int(fresh.sum()))
+        index = dict(zip([*ids, *new], [*again[first], *np.flatnonzero(fresh)], strict=True))
         candidates.count(seen, place[again[first]], covariance[again[first]], missed)
-        candidates.add(self._new_ids(int(fresh.sum())), place[fresh], covariance[fresh], former=False)
+        candidates.add(new, place[fresh], covariance[fresh], former=False)
         ready = candidates.sightings >= self.settings.confirm_after
-        if ready.any():
-            position = candidates.position[ready]
-            coupling = -pose.rotation.T @ constellation.modes.evaluate(pose.apply(position))
-            constellation.add(candidates.ids[ready], position, candidates.covariance[ready], coupling)
-            candidates.keep(~ready)
+        if not ready.any():
+            return none, none
+        position, ids = candidates.position[ready], candidates.ids[ready]
+        # They are where they are seen from this pose, and its errors are theirs.
+        lever = pose.rotation.T @ pose_jacobian(position, pose.rotation) @ solution.gain
+        response = modes + pose.rotation @ constellation.coupling[rows]
+        response = response.reshape(3 * len(rows), modes.shape[2])
+        coupling = lever @ response - pose.rotation.T @ constellation.modes.evaluate(pose.apply(position))
+        share = (lever.reshape(-1, len(rows), 3) @ pose.rotation).reshape(-1, 3 * len(rows))
+        joined = len(constellation) + np.arange(len(ids))
+        constellation.add(ids, position, candidates.covariance[ready], coupling, (rows, share))
+        candidates.keep(~ready)
+        return joined, np.array([index[each] for each in ids])
 
     def _follow(
         self, view: Usable, constellation: Constellation, pose: RigidPose, match: Indices, in_solution: Mask

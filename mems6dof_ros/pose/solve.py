@@ -28,8 +28,8 @@ class Solution(NamedTuple):
     ``tested_z`` (n,): where the body's own z is known well enough for the residual to tell something;
     ``squares`` (n, 2): squared normalised residuals in xy and z, and ``freedom`` (n, 2): their expectations
     where the covariances are true, the particle's own pull on the pose taken off; 0 where not used;
-    ``chi_square`` and ``degrees_of_freedom`` of the whole. ``ok`` is False where the particles do not fix
-    a pose."""
+    ``chi_square`` and ``degrees_of_freedom`` of the whole; ``gain`` (6, 3 n): change of the pose with what is
+    measured. ``ok`` is False where the particles do not fix a pose."""
 
     ok: bool
     pose: RigidPose
@@ -42,6 +42,7 @@ class Solution(NamedTuple):
     freedom: Array
     chi_square: float
     degrees_of_freedom: int
+    gain: Array
 
 
 def solve_pose(
@@ -73,17 +74,19 @@ def solve_pose(
     count_xy, count_z = int((use > UNUSED).sum()), int((use == FULL).sum())
     if not ok:
         nan = np.full((6, 6), np.nan)
-        return Solution(False, pose, nan, nan, use, residual, tested_z, squares, freedom, math.nan, 0)
+        return Solution(
+            False, pose, nan, nan, use, residual, tested_z, squares, freedom, math.nan, 0, np.empty((6, 0))
+        )
 
     # The exact solution with the field error common to all: one linear step from a converged start.
-    step, covariance, noise, chi_square = _marginalise(
+    step, covariance, noise, chi_square, gain = _marginalise(
         body @ rotation.T, field, weight, residual, measured_covariance
     )
     residual[use == UNUSED] = np.nan
     pose = RigidPose(_exp(step[3:]) @ rotation, translation + step[:3])
     return Solution(
         bool(np.isfinite(covariance).all()), pose, covariance, noise, use, residual, tested_z,
-        squares, freedom, chi_square, 2 * count_xy + count_z - 6,
+        squares, freedom, chi_square, 2 * count_xy + count_z - 6, gain,
     )  # fmt: skip
 
 
@@ -158,7 +161,7 @@ def _marginalise(moved, field, weight, residual, measured_covariance):  # type: 
     """One linear step in the field error's coefficients (k, unit prior) and the pose (6), in this order.
 
     Returns the step of the pose, its covariance, the part of it that the localizations' own noise makes
-    (gain times their covariance), and chi-square; ``residual`` is updated.
+    (gain times their covariance), chi-square and the gain; ``residual`` is updated.
     """
     n, k = len(moved), field.shape[2]
     size = k + 6
@@ -230,7 +233,7 @@ def _marginalise(moved, field, weight, residual, measured_covariance):  # type: 
         for a in range(3):
             for b in range(3):
                 chi_square += residual[i, a] * weight[i, a, b] * residual[i, b]
-    return step[k:].copy(), covariance, noise, chi_square
+    return step[k:].copy(), covariance, noise, chi_square, gain
 
 
 @njit(cache=True, nogil=True)

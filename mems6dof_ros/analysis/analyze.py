@@ -24,6 +24,7 @@ from mems6dof_ros.recording.bag import BagWriter
 from mems6dof_ros.recording.frames import write_frame
 from mems6dof_ros.recording.poses import pose_messages
 from mems6dof_ros.recording.tables import CYCLES, LOCALIZATIONS, TableWriter, sightings
+from mems6dof_ros.sources.bag import BagSource
 from mems6dof_ros.sources.source import FrameSource
 
 #: Called as progress(done, total) after every frame; total 0: unknown.
@@ -102,8 +103,7 @@ def analyze(
                 _write(bag, frame, found, poses, keep_images)
                 for pose in poses:
                     cycles.write(pose)
-                for sighting in sightings(found, poses):
-                    particles.write(sighting)
+                particles.write_rows(sightings(found, poses))
                 _count(summary, frame, found, poses)
                 if summary.frames % _FLUSH_EVERY == 0:
                     for writer in (bag, cycles, particles):
@@ -169,9 +169,12 @@ def _results(
 ) -> Generator[Callable[[], tuple[Frame, Localizations]], None, None]:
     """For each frame, in order, what returns it with its localizations or raises its InputError.
 
-    One thread reads, ``workers`` localize: compiled kernels, OpenCV and decompression leave the interpreter
-    to others. One thread from beginning to end reads, because some files insist on that.
+    One thread reads, ``workers`` localize, and as many decompress a bag: compiled kernels, OpenCV and
+    decompression leave the interpreter to others. One thread from beginning to end reads, because some files
+    insist on that.
     """
+    if isinstance(source, BagSource):
+        source.threads = workers
     pending: deque[Future[tuple[Frame, Localizations] | None]] = deque()
 
     def measure(read: Future[Frame | None]) -> tuple[Frame, Localizations] | None:

@@ -26,6 +26,7 @@ from rosbags.highlevel import AnyReader
 
 from mems6dof_ros import __version__
 from mems6dof_ros.errors import InputError
+from mems6dof_ros.recording import read_ahead
 from mems6dof_ros.recording.definitions import PACKAGE, definition, named_types, typestore
 from mems6dof_ros.recording.messages import Message, serialize
 from mems6dof_ros.recording.metadata import (
@@ -389,8 +390,10 @@ class BagReader:
         listed = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
         return [file.name for file in mcap_files(self.path) if file.name not in map(os.path.basename, listed)]
 
-    def messages(self, topics: Iterable[str] | None = None) -> Iterator[Recorded]:
-        """Messages of ``topics`` (all by default) in the order in which they were received."""
+    def messages(self, topics: Iterable[str] | None = None, threads: int = 1) -> Iterator[Recorded]:
+        """Messages of ``topics`` (all by default) in the order in which they were received.
+
+        ``threads`` read and decompress, where there are chunks that need not be merged."""
         wanted = None if topics is None else set(topics)
         chosen = [c for c in self._reader.connections if wanted is None or c.topic in wanted]
         if not chosen:
@@ -398,9 +401,29 @@ class BagReader:
         with _readable(self.path):
             for typename in {connection.msgtype for connection in chosen} & INTERPRETED:
                 self._compare_definition(typename)
-            for connection, log_time_ns, data in self._reader.messages(chosen):
-                message = self._reader.deserialize(data, connection.msgtype)
-                yield Recorded(connection.topic, connection.msgtype, log_time_ns, message)
+            types = {connection.topic: connection.msgtype for connection in chosen}
+            places = None
+            if threads > 1 and len(types) == len(chosen) and (files := self._files()):
+                places = read_ahead.ordered_chunks(files, types)
+            found: Iterable[tuple[str, int, bytes | memoryview]] = (
+                ((c.topic, log_time_ns, data) for c, log_time_ns, data in self._reader.messages(chosen))
+                if places is None
+                else read_ahead.messages(places, threads)
+            )
+            for topic, log_time_ns, data in found:
+                message = self._reader.deserialize(data, types[topic])  # type: ignore[arg-type]
+                yield Recorded(topic, types[topic], log_time_ns, message)
+
+    def _files(self) -> list[Path]:
+        """The .mcap files in the order of the recording, none where it is of another kind."""
+        if self.path.suffix == ".mcap":
+            return [self.path]
+        if not self.path.is_dir():
+            return []
+        text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
+        listed = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        files = [self.path / name for name in listed]
+        return files if all(file.suffix == ".mcap" for file in files) else []
 
     def _compare_definition(self, typename: str) -> None:
         """Raise InputError where the bag's definition lacks a field of ours, or has it of another type."""

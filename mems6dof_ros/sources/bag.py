@@ -26,8 +26,11 @@ class BagSource:
 
     ``topic``: the sensor_msgs/Image to read; empty: the only one, or the only one named image_raw.
     ``frame_info`` and ``truth`` are taken from beside it; without frame_info, as in other
-    people's bags, frames and motion cycles are counted from 0, one cycle per frame.
+    people's bags, frames and motion cycles are counted from 0, one cycle per frame. ``threads`` read and
+    decompress ahead, from the next ``start`` on.
     """
+
+    threads = 1
 
     def __init__(self, path: str | Path, *, topic: str = "") -> None:
         self._path = Path(path)
@@ -75,8 +78,9 @@ class BagSource:
     def _parts(self) -> Iterator[dict[str, Any]]:
         """Messages of one stamp belong together."""
         pending: dict[int, dict[str, Any]] = {}
+        wanted = self._topic, self._info_topic, self._truth_topic
         with BagReader(self._path) as bag:
-            for recorded in bag.messages((self._topic, self._info_topic, self._truth_topic)):
+            for recorded in bag.messages(wanted, self.threads):
                 stamp = messages.nanoseconds(recorded.message.header.stamp)
                 if recorded.topic == self._topic and "image" in pending.get(stamp, {}):
                     yield pending.pop(stamp)  # a stamp that repeats (unset?) tells nothing apart

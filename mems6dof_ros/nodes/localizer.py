@@ -200,11 +200,12 @@ class LocalizerNode(InstrumentNode):
         if image and not self._matcher.has_image(stamp_ns):
             self._matcher.add_image(stamp_ns, image, time.time_ns())
             self._shared_stamps.append(stamp_ns)
-        self._choose(image is not None)
+        self._choose(stamp_ns, image is not None)
         self._forward()
 
-    def _choose(self, shared: bool) -> None:
-        """Subscribe to the images, or no more, upon an info whose frame was ``shared`` or not."""
+    def _choose(self, stamp_ns: int, shared: bool) -> None:
+        """Subscribe to the images, or no more, upon an info whose frame is ``shared`` or not; one that
+        came too late for its frame says nothing."""
         assert self.stream is not None
         soon = time.monotonic() - self._informed_at < _SOON
         self._informed_at = time.monotonic()
@@ -212,7 +213,7 @@ class LocalizerNode(InstrumentNode):
         if self._by_topic and self._in_a_row >= _SHARED_IN_A_ROW:
             self.stream.unsubscribe(topics.IMAGE)
             self._by_topic = False
-        elif not self._by_topic and not shared:
+        elif not (self._by_topic or shared or self._shared.overtaken(stamp_ns)):
             self._subscribe_to_images()
 
     def _on_image(self, data: bytes) -> None:

@@ -178,6 +178,14 @@ class SharedFrames:
             header, height, width, _ENCODINGS[itemsize], width * itemsize, data, _BIG_ENDIAN, slot, serial
         )
 
+    def overtaken(self, stamp_ns: int) -> bool:
+        """There is a ring, and in it are but later frames than that."""
+        if self._ring is None:
+            return False
+        slots = self._ring.slots()
+        written = slots["stamp_ns"][slots["serial"] > 0]
+        return len(written) > 1 and bool((written > stamp_ns).all())
+
 
 _BIG_ENDIAN = int(np.dtype(np.uint16) == np.dtype(">u2"))
 

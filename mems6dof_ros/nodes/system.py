@@ -334,8 +334,8 @@ _ARRANGEMENT = {
 _TRACKING = {
     "tracking": (
         "true",
-        "Fit where the motion of the one body says that its particles will be, and search whole frames now and"
-        " then; false: search every frame. Of several bodies none is followed",
+        "Fit where the motion of the one body says that its particles will be, and search whole frames now"
+        " and then; false: search every frame. Of several bodies none is followed",
     )
 }
 _MONITOR = {"monitor": ("false", "true: show it live to browsers on this machine, see docs/monitor.md")}

@@ -74,8 +74,11 @@ def test_a_frame_that_is_overwritten_is_known(path: Path) -> None:
         ring.write(frame(number))
     assert image is not None
     assert image.intact()
+    assert not reader.overtaken(1000)
     ring.write(frame(SLOTS))
     assert not image.intact()
+    assert reader.overtaken(1000)
+    assert not reader.overtaken(1000 + SLOTS + 1)  # of whom nobody wrote
 
 
 def test_of_two_frames_with_one_stamp_the_later_is_found(path: Path) -> None:

@@ -254,6 +254,18 @@ def test_a_camera_driver_of_somebody_else() -> None:
     assert command(table[0])[4:6] == ["-r", "image_raw:=/camera/image"]
 
 
+def test_live_one_body_is_tracked() -> None:
+    def tracking(**values: str) -> list[bool]:
+        table = SYSTEMS["live"].table({"calibration": "c.yaml", **values})
+        chosen = [node for node in table if node.executable in ("localizer", "pipeline")]
+        return [node.parameters.get("tracking.enabled", False) for node in chosen]
+
+    assert tracking() == tracking(arrangement="pipeline") == [True]
+    assert tracking(tracking="false") == [False]
+    with pytest.raises(InputError, match="argument tracking"):
+        tracking(tracking="perhaps")
+
+
 def test_calibrating_needs_no_localizer() -> None:
     system = SYSTEMS["calibrate"]
     assert [node.executable for node in system.table({})] == ["frame_source", "calibrator"]

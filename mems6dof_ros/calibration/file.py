@@ -38,8 +38,9 @@ from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
 FORMAT = "mems6dof-calibration"
 DEFAULT_METHOD = "joint"
-#: Standard deviations by which two estimates of z differ if they are on different branches.
-BRANCHES_APART = 5.0
+#: Standard deviations by which two estimates of z differ if they are on different branches, or if that from
+#: one feature is beyond the reach of its linearised covariance.
+BRANCHES_APART = 4.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import cast
 
 from mems6dof_ros.cli.figures import add_json_option, conclude, print_table
-from mems6dof_ros.figures import Figure
+from mems6dof_ros.errors import Mems6dofError
+from mems6dof_ros.figures import Figure, exactly
 
 #: Part to the module that measures it by ``figures(work: Path, seed: int, tell: Callable[[str], None])``: it
 #: works in the directory ``work``, tells what it is doing, and yields rows of the table.
@@ -56,7 +57,12 @@ def run(args: argparse.Namespace) -> int:
         for part in parts:
             work = (args.out or Path(temporary)) / part
             work.mkdir(parents=True, exist_ok=True)
-            rows = list(_figures(part, work, args))
+            rows = []
+            try:
+                for row in _figures(part, work, args):
+                    rows.append(row)
+            except Mems6dofError as error:  # the other parts are measured all the same
+                rows.append(exactly(f"{part}: broken off: {error}", 1, 0))
             print_table(rows)
             table += rows
     return conclude(table, {"parts": parts, "seed": args.seed}, args.json)

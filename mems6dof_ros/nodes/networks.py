@@ -89,7 +89,8 @@ def across_machines(
     parameters = {f"simulator.{name}": value for name, value in options.items()}
     bag = work / "bag"
     source, localizer, *others = chain(
-        NodeSpec("frame_source", {"pacing": "rate", "rate": rate, **parameters}),
+        # These two hosts are one, but two would have no memory in common.
+        NodeSpec("frame_source", {"pacing": "rate", "rate": rate, "share_frames": False, **parameters}),
         calibration="",
         output=str(bag),
     )

@@ -143,6 +143,7 @@ def test_a_full_disk_ends_the_record_and_says_so(start: Start, peer: Peer, small
 
 def test_a_killed_recorder_loses_one_cycle_at_most(domain: int, tmp_path: Path) -> None:
     for death in die(tmp_path / "killed", seed=1, kills=3, size=64, rate=100.0):
+        assert death, "a recorder that heard nothing within a minute"
         assert death.written > 20
         assert death.must >= death.written - 12  # of four messages a cycle, and a file may just have ended
         assert death.written >= death.after == death.indexed >= death.must

@@ -19,6 +19,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from mems6dof_ros.cli.main import main
+from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, exactly, information
 from mems6dof_ros.recording.recover import mcap_files
 from mems6dof_ros.recording.validation.processes import kill, traffic, until, witnessed_recorder
@@ -48,8 +49,11 @@ def figures(work: Path, seed: int, tell: Callable[[str], None], kills: int = KIL
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     for size, rate, number in ((64, 250.0, kills), (2048, 30.0, max(kills // 10, 1))):
         tell(f"kill the recorder {number} times, {size} x {size} px at {rate:g}/s")
-        deaths = list(die(work / f"killed_{size}", seed, number, size, rate))
+        lives = list(die(work / f"killed_{size}", seed, number, size, rate))
+        deaths = [death for death in lives if death]
         name = f"SIGKILL, {size} px"
+        silent = len(lives) - len(deaths)
+        yield exactly(f"{name}: starts after which no message came within a minute", silent, 0)
         yield information(f"{name}: kills", len(deaths))
         yield information(f"{name}: cycles/s recorded, median", float(np.median([d.rate for d in deaths])))
         yield information(f"{name}: messages written", sum(d.written for d in deaths))
@@ -63,20 +67,31 @@ def figures(work: Path, seed: int, tell: Callable[[str], None], kills: int = KIL
         yield information(f"{name}: oldest message that did not come back, ms before", oldest)
 
 
-def die(work: Path, seed: int, kills: int, size: int, rate: float) -> Iterator[Death]:
-    """Kill a recorder at a random moment, ``kills`` times, while ``rate`` cycles per second pass."""
+def die(work: Path, seed: int, kills: int, size: int, rate: float) -> Iterator[Death | None]:
+    """Kill a recorder at a random moment, ``kills`` times, while ``rate`` cycles per second pass.
+
+    None for one that heard nothing within a minute; what it listens to is then started anew, too.
+    """
     rng = random.Random(seed)
     namespace = f"crash_{os.getpid()}"
     bag, noted = work / "bag", work / "journal"
     work.mkdir(parents=True)
-    with traffic(namespace, rate, size) as publisher:
+    with contextlib.ExitStack() as stack:
+        publisher = stack.enter_context(traffic(namespace, rate, size))
         for _ in range(kills):
             shutil.rmtree(bag, ignore_errors=True)
             with witnessed_recorder(namespace, bag, noted, split_duration=0.7) as (process, journal):
-                until(lambda: len(journal.written[0]), "message recorded", process, publisher)
-                time.sleep(rng.uniform(0.05, 1.5))
+                try:
+                    until(lambda: len(journal.written[0]), "message recorded", process, publisher)
+                    time.sleep(rng.uniform(0.05, 1.5))
+                except Mems6dofError:
+                    stack.close()
+                    publisher = stack.enter_context(traffic(namespace, rate, size))
+                    silent = True
+                else:
+                    silent = False
                 killed = kill(process)
-            yield _examine(bag, journal, killed)
+            yield None if silent else _examine(bag, journal, killed)
 
 
 def _examine(bag: Path, journal: Journal, killed: int) -> Death:

@@ -86,14 +86,14 @@ def measure(work: Path, tell: Callable[[str], None], quick: bool = False, **_: A
     material = Material(work, quick=quick)
     with chromium() as browser:
         tell(f"one process at {DRIVE:.0f} cycles/s, with a page and without")
-        yield from _in_turns(material, "pipeline", DRIVE, browser, quick)
+        yield from _in_turns(material, "pipeline", DRIVE, browser, 2 if quick else _ROUNDS)
         tell(f"four processes at {_FOUR_PROCESSES:.0f} cycles/s")
-        for row in _in_turns(material, "processes", _FOUR_PROCESSES, browser, quick):
+        for row in _in_turns(material, "processes", _FOUR_PROCESSES, browser, 2):
             yield information(row["quantity"], row["measured"])
 
 
 def _in_turns(
-    material: Material, arrangement: str, rate: float, browser: Any, quick: bool
+    material: Material, arrangement: str, rate: float, browser: Any, rounds: int
 ) -> Iterator[Figure]:
     """Figures of one run of an ``arrangement`` that tracks, of nodes.system.chain."""
     name, poses = namespace(), _Poses()
@@ -101,7 +101,6 @@ def _in_turns(
         "here": lambda url: _browsing(browser, url),
         "elsewhere": _reading,
     }
-    rounds = 2 if quick else _ROUNDS
     with (
         poses.listening(name),
         run_system(
@@ -117,7 +116,7 @@ def _in_turns(
         def listen() -> tuple[float, float]:
             time.sleep(_SETTLE)
             begin = time.monotonic()
-            time.sleep(_LENGTH / 2 if quick else _LENGTH)
+            time.sleep(_LENGTH)
             return poses.since(begin)
 
         without, ratios = [listen()], defaultdict(list)

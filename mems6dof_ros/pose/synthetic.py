@@ -43,14 +43,16 @@ class GearMotion:
 class Scene:
     """A constellation and how it is seen.
 
-    ``particles`` on a disc of ``radius`` m; ``field`` (width, height) m; ``sd_xy``, ``sd_z`` m of the
-    localizations, spread over particles by the factor exp(N(0, ``spread``)); ``missing`` and ``spurious``:
-    fraction of the visible; ``wrong_z``: fraction on the wrong axial branch, unflagged; ``field_error_xy``,
-    ``field_error_z`` m rms of a smooth static error, not claimed by the covariances.
+    ``particles`` on a disc of ``radius`` m with a hole of ``inner_radius`` m; ``field`` (width, height) m;
+    ``sd_xy``, ``sd_z`` m of the localizations, spread over particles by the factor exp(N(0, ``spread``));
+    ``missing`` and ``spurious``: fraction of the visible; ``wrong_z``: fraction on the wrong axial branch,
+    unflagged; ``field_error_xy``, ``field_error_z`` m rms of a smooth static error, not claimed by the
+    covariances.
     """
 
     particles: int = 100
     radius: float = 164e-6
+    inner_radius: float = 0.0
     relief: float = 0.5e-6
     field: tuple[float, float] = (260e-6, 260e-6)
     sd_xy: float = 2.3e-9
@@ -78,7 +80,8 @@ class SyntheticGear:
         self.scene, self.body = scene, body
         self.random = np.random.default_rng([seed, 20231])
         n = scene.particles
-        radius = scene.radius * np.sqrt(self.random.random(n))
+        hole = (scene.inner_radius / scene.radius) ** 2
+        radius = scene.radius * np.sqrt(hole + (1 - hole) * self.random.random(n))
         azimuth = self.random.uniform(0, math.tau, n)
         height = self.random.normal(0, scene.relief, n)
         self.particles = np.c_[radius * np.cos(azimuth), radius * np.sin(azimuth), height]

@@ -30,11 +30,15 @@ BOUND_EVERY = 20
 class OpticalRun:
     """``comparison`` of all poses with truth; ``settled``: of those after the first revolution, in which the
     field error and the constellation are learnt; ``bound`` (6,): standard deviations that the light of all
-    visible particles allows where optics and constellation are known and no two particles overlap."""
+    visible particles allows where optics and constellation are known and no two particles overlap. Means over
+    all cycles: ``visible`` particles, how many were ``used``, and ``electrons`` of one."""
 
     comparison: TruthComparison
     settled: TruthComparison
     bound: Array
+    visible: float
+    used: float
+    electrons: float
 
 
 def optical_chain(
@@ -62,7 +66,14 @@ def optical_chain(
     comparison = compare(poses, truths)
     revolution = math.ceil(math.tau / abs(settings.step))
     settled = comparison.between(int(comparison.cycle[0]) + revolution, int(comparison.cycle[-1]))
-    return OpticalRun(comparison, settled, np.sqrt(np.mean(bounds, axis=0)))
+    return OpticalRun(
+        comparison,
+        settled,
+        np.sqrt(np.mean(bounds, axis=0)),
+        visible=float(np.mean([len(truth.particle_id) for truth in truths])),
+        used=float(np.mean([pose.particles_used for pose in poses])),
+        electrons=float(np.concatenate([truth.electrons for truth in truths]).mean()),
+    )
 
 
 def pose_bound(experiment: Experiment, truth: GroundTruth) -> Array:

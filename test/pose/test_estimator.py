@@ -17,7 +17,15 @@ from mems6dof_ros.pose.cycle_pose import Status
 from mems6dof_ros.pose.estimator import PoseEstimator, PoseSettings, Region
 from mems6dof_ros.pose.synthetic import GearMotion, Scene, SyntheticGear, make_localizations
 from mems6dof_ros.pose.usable import usable
-from mems6dof_ros.pose.validation import follow, interrupt, precision, two_bodies, unsteady_steps
+from mems6dof_ros.pose.validation import (
+    RING_GEAR,
+    follow,
+    interrupt,
+    nees_since_first,
+    precision,
+    two_bodies,
+    unsteady_steps,
+)
 
 FIELD_ERRORS = Scene(field_error_xy=5e-9, field_error_z=30e-9)
 
@@ -122,6 +130,15 @@ def test_relative_motion_of_two_bodies_is_honest():
         ]
         values.append(error @ np.linalg.solve(covariance, error) / 6)
     assert np.mean(values) == pytest.approx(1, abs=0.25)
+
+
+def test_a_ring_gear_stays_honest_when_its_first_particles_have_left():
+    """12 runs, NEES/6 of one pose each: 1 within three standard deviations of 0.17."""
+    settings = PoseSettings(field_size=RING_GEAR.field, field_degree=0, recentre_at=())
+    runs = [follow(RING_GEAR, seed, 81, settings) for seed in range(1, 13)]
+    assert sum(run.lost + run.wrong_identities for run in runs) == 0
+    for cycle in (20, 80):
+        assert 0.5 < np.mean([nees_since_first(run, cycle) for run in runs]) < 1.5
 
 
 def test_chained_registration_works_and_is_worse():

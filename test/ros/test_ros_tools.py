@@ -53,6 +53,8 @@ def domain(tmp_path_factory: pytest.TempPathFactory, calibration: str) -> Iterat
         calibrator = SYSTEMS["calibrate"].table({})[-1]
         with run_system([*nodes, calibrator], on_line=lambda line: None):
             yield number
+        if shutil.which("ros2"):  # some commands have no way but by their daemon
+            subprocess.run(["ros2", "daemon", "stop"], capture_output=True, timeout=PATIENCE)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import importlib
 import os
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -188,6 +189,10 @@ def test_action(peer: Peer) -> None:
 def test_the_commands_themselves(domain: int, command: str, expected: list[str]) -> None:
     environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
     arguments: list[Any] = ["timeout", "--signal=INT", "20", "ros2", *command.split()]
-    result = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=PATIENCE)
-    for text in expected:
-        assert text in result.stdout + result.stderr
+    said, deadline = "", time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:  # until the nodes are up, and discovered
+        result = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=PATIENCE)
+        said = result.stdout + result.stderr
+        if all(text in said for text in expected):
+            return
+    raise AssertionError(said)

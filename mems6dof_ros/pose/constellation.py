@@ -173,8 +173,8 @@ class Constellation:
         microscope, body = self._frames
         constant = microscope + (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
         joint = _blocks(self._joint, rows)
-        own = pose.rotation @ self.covariance[rows] @ pose.rotation.T
-        weight = weights(noise + own, has_z)
+        # They only say which motion counts as common: that x and y are not turned does not matter.
+        weight = weights(noise + self.covariance[rows], has_z)
         response, spread, covariance = _relative(
             rows,
             modes,
@@ -377,10 +377,7 @@ class Relative(NamedTuple):
     def of_pose(self, rotation: Array, gain: Array) -> Array:
         """What the errors of the map add to the covariance of a pose of ``rotation`` (3, 3) beyond
         ``covariance``, had it been independent: K (P - D) K^T with the ``gain`` K (6, 3 n)."""
-        gain = (gain.reshape(6, -1, 3) @ rotation).reshape(6, -1)
-        independent = gain.reshape(6, -1, 3).swapaxes(0, 1) @ self.covariance
-        both = independent.swapaxes(0, 1).reshape(6, -1) @ gain.T
-        return np.asarray(gain @ self.joint @ gain.T - both)
+        return np.asarray(_carried(self.joint, self.covariance, rotation, gain))
 
 
 class Candidates:
@@ -462,6 +459,25 @@ def _blocks(joint, rows):  # type: ignore[no-untyped-def]
                 for b in range(3):
                     line[3 * j + b] = given[3 * rows[j] + b]
     return out
+
+
+@njit(cache=True, nogil=True)
+def _carried(joint, covariance, rotation, gain):  # type: ignore[no-untyped-def]
+    """See ``Relative.of_pose``."""
+    n = len(covariance)
+    turned = np.empty((6, 3 * n))
+    for q in range(6):
+        for i in range(n):
+            g = gain[q, 3 * i : 3 * i + 3]
+            for a in range(3):
+                turned[q, 3 * i + a] = g[0] * rotation[0, a] + g[1] * rotation[1, a] + g[2] * rotation[2, a]
+    shared = np.dot(turned, joint)
+    for q in range(6):
+        for i in range(n):
+            for a in range(3):
+                for b in range(3):
+                    shared[q, 3 * i + a] -= covariance[i, a, b] * turned[q, 3 * i + b]
+    return np.dot(shared, turned.T)
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})

@@ -39,6 +39,8 @@ _SECOND = 60.0
 _POOR, _LEAST_POOR = 4.0, 0.03
 #: Of several particles fitted together, the light of the faintest over that of the brightest, at least.
 LEAST_LIGHT = 0.02
+#: Each of two that one Gaussian took for one has at least this of the median light of the others.
+LEAST_OF_SPLIT = 0.5
 _MOST_ORDER, _DEGREE = 5, 26
 _BACKGROUND = 10.0  # electrons per pixel, for weights only
 _SAMPLE = 800
@@ -50,6 +52,7 @@ class _One(NamedTuple):
     position: Array
     covariance: Array
     quality: Array
+    light: Array
 
     @property
     def deviance(self) -> float:
@@ -135,17 +138,19 @@ class PsfEstimator:
                 weight = 1 / (1 + np.exp(z_gap[i] / 2))
                 spread = second.covariance + np.outer(offset, offset)
                 best[1][i] = (1 - weight) * first.covariance + weight * spread
-        position, covariance, quality = best
+        position, covariance, quality, light = best
         flags = self._flags(position, covariance, quality, z_gap, fits.flux)
-        return self._with_neighbours(fits, image, Positions(position, covariance, z_gap, flags))
+        return self._with_neighbours(fits, image, Positions(position, covariance, z_gap, flags), light)
 
-    def _fit(self, image: NDArray[np.generic], places_px: Array, z: Array) -> tuple[Array, Array, Array]:
-        """Positions (n, 3) m, covariances and quality of the fits that start at ``z`` (n,) m."""
+    def _fit(
+        self, image: NDArray[np.generic], places_px: Array, z: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Positions (n, 3) m, covariances, quality and light of the fits that start at ``z`` (n,) m."""
         start = self._start(places_px, z)
         n = len(z)
         parameters, covariance, quality = start.parameters, np.empty((n, 3, 3)), np.empty((n, 4))
         maximise(*self._arguments(image, start), parameters, covariance, quality)
-        return *self._in_metres(start, covariance), quality
+        return *self._in_metres(start, covariance), quality, parameters[:, 3]
 
     def _start(self, places_px: Array, z: Array) -> _Start:
         """Where fits of particles seen at ``places_px`` (n, 2) begin that are taken to be at ``z`` (n,) m."""
@@ -182,13 +187,17 @@ class PsfEstimator:
 
     # ------------------------------------------------------------------------ neighbours
 
-    def _with_neighbours(self, fits: GaussianFits, image: NDArray[np.generic], found: Positions) -> Positions:
-        """``found`` with particles in each other's light fitted together, and with two positions for what one
-        Gaussian was fitted to where the pixels show two particles."""
+    def _with_neighbours(
+        self, fits: GaussianFits, image: NDArray[np.generic], found: Positions, light: Array
+    ) -> Positions:
+        """``found``, of ``light`` electrons, with particles in each other's light fitted together, and with
+        two positions for what one Gaussian was fitted to where the pixels show two particles."""
         unclear = (found.flags & (Flag.POOR_FIT | Flag.NO_Z)) != 0
         clear = found.position[~unclear, 2]
         # All particles of a body are at about one height: where a fit alone is of no use, that is the start.
         usual = float(np.median(clear)) if len(clear) else 0.5 * sum(self._z_range)
+        # And of about one light, so that one out of focus is not taken for two.
+        least_light = LEAST_OF_SPLIT * float(np.median(light[~unclear])) if len(clear) else np.inf
         z = np.where(unclear, usual, found.position[:, 2])
         places = fits.parameters[:, :2]
         sharing = groups(places, self._window_px)
@@ -208,7 +217,8 @@ class PsfEstimator:
                     continue
                 of = np.r_[blob, blob, others]
                 heights = np.r_[usual, usual, z[others]]
-                if fit := self._together(image, of, np.concatenate([two, places[others]]), heights):
+                fit = self._together(image, of, np.concatenate([two, places[others]]), heights)
+                if fit and fit.light[:2].min() > least_light:
                     joints.append(fit)
                     break
         return _replaced(fits, found, joints) if joints else found

@@ -111,6 +111,11 @@ class Bystander:
         answer = client.call_async(kind.Request())  # type: ignore[attr-defined]
         self.until(answer.done, f"answer of {service}")
 
+    def subscriptions(self, name: str) -> list[tuple[str, list[str]]]:
+        """Topics, and their types, that the node of this ``name`` in the namespace listens to."""
+        self.until(lambda: name in self.node.get_node_names(), f"node {name}")
+        return self.node.get_subscriber_names_and_types_by_node(name, f"/{self.namespace}")
+
     def publisher(self, kind: type, topic: str, listeners: int = 1) -> Any:
         """A publisher that so many listen to."""
         wanted = self.node.get_subscriptions_info_by_topic(topic)

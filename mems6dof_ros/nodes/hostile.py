@@ -204,9 +204,7 @@ def fuzzed_topics(
         attacked = {
             (topic, kinds[0])
             for name in names
-            for topic, kinds in bystander.node.get_subscriber_names_and_types_by_node(
-                name, f"/{bystander.namespace}"
-            )
+            for topic, kinds in bystander.subscriptions(name)
             if topic not in _NOT_OURS
         }
         sent = 0

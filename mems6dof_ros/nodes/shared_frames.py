@@ -157,7 +157,8 @@ class SharedFrames:
             self._ring, self._inode = None, 0
             return
         if inode != self._inode:
-            self._ring, self._inode = _opened(self._path), inode
+            self._ring = _opened(self._path)
+            self._inode = inode if self._ring else 0  # one that is just being made, look again
         if self._ring:
             self._ring.head["attention"] = time.monotonic()
 

@@ -200,6 +200,7 @@ def test_results_are_the_same_by_either_way(
     peer.listen(Localizations, "localizations")
     localizer = start("localizer", "-p", f"calibration:={calibration}")
     localizer.wait_for_line("ready")
+    peer.wait(lambda: peer.node.count_publishers("localizations"))
     small = [word for name, value in SMALL_GEAR.items() for word in ("-p", f"simulator.{name}:={value}")]
     cycles = ["-p", "simulator.cycles:=12", "-p", "pacing:=consumer", "-p", f"share_frames:={share}"]
     assert start("frame_source", *cycles, *small).wait() == 0

@@ -43,6 +43,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         default="map",
         help="register to the constellation map (default) or to the previous micrograph",
     )
+    parser.add_argument(
+        "--beyond-calibration",
+        action="store_true",
+        help="use particles outside the calibration's ranges of z, field and brightness, too",
+    )
     parser.add_argument("--keep-images", action="store_true", help="write the images into the new bag too")
     parser.add_argument(
         "--workers", type=int, default=1, help="frames localized at a time (default: %(default)s)"
@@ -70,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     source = open_input(args.input, args)
     camera = camera_of(args, source.info, calibration.camera if calibration else None)
     localizer = Localizer(camera, calibration)
-    settings = PoseSettings(reference=args.reference)
+    settings = PoseSettings(reference=args.reference, beyond_calibration=args.beyond_calibration)
     field = FieldError.remaining(calibration.correction, settings) if calibration else None
     estimators: Sequence[PoseEstimator] = []
     if calibration:

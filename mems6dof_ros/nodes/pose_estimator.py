@@ -63,6 +63,10 @@ _SETTINGS = {
     "field_degree": ("1", "Degree of the smooth field error that is estimated with the map; 0: none."),
     "field_sd_xy": ("m", "Its prior standard deviation in x and y: what the calibration leaves."),
     "field_sd_z": ("m", "Likewise in z."),
+    "beyond_calibration": (
+        "",
+        "Use particles outside the ranges of z, field and brightness of the calibration, too.",
+    ),
     "recentre_at": (
         "rad",
         "Turns since the reference at which the origin moves to the centre of rotation as known by then, each"

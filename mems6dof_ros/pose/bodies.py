@@ -78,7 +78,7 @@ class Bodies:
         settings = self.estimators[0].settings
         if len(self.estimators) == 1 or self.estimators[0].field is not None:
             return
-        view = usable(localizations)
+        view = usable(localizations, beyond=settings.beyond_calibration)
         seen = view.position[view.good, :2]
         if len(seen) >= settings.min_particles:
             field = FieldError.assumed(settings, np.abs(seen).max(axis=0))

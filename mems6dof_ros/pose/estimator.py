@@ -104,7 +104,7 @@ class PoseEstimator:
             when = "again" if order == self._last_frame else f"after cycle {cycle}, frame {frame}"
             reason = f"cycle {order[0]}, frame {order[1]} arrived {when}: ignored; reset to start anew"
             return self._lost(localizations, reason)
-        view = usable(localizations, available)
+        view = usable(localizations, available, self.settings.beyond_calibration)
         self._last_frame = order
         if self.region is not None:
             view = view.only(self.region.contains(view.position))

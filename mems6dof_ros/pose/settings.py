@@ -32,6 +32,7 @@ class PoseSettings:
     field_size: (width, height) of the field; None: taken from where particles are seen.
     field_degree: degree of the smooth field error that is estimated with the map; 0: none.
     field_sd_xy, field_sd_z: its prior standard deviation, what the calibration leaves over the field.
+    beyond_calibration: use particles outside the ranges of z, field and brightness of the calibration, too.
     recentre_at: turns (rad, since the reference) after which the origin is moved to the centre of rotation as
         known by then; each such moment is a new reference version. Empty: only ``set_reference``.
     """
@@ -59,6 +60,7 @@ class PoseSettings:
     field_degree: int = 4
     field_sd_xy: float = 5e-9
     field_sd_z: float = 30e-9
+    beyond_calibration: bool = False
     recentre_at: tuple[float, ...] = (math.radians(30), math.tau)
 
     def __post_init__(self) -> None:

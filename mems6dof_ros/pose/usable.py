@@ -16,6 +16,8 @@ Mask = NDArray[np.bool_]
 
 #: Flags with which x and y are still good: their covariance says how good.
 LATERAL_ONLY = int(Flag.Z_AMBIGUOUS | Flag.NO_Z | Flag.Z_OUT_OF_RANGE)
+#: Flags of what the calibration was not made for.
+BEYOND = int(Flag.Z_OUT_OF_RANGE | Flag.OUT_OF_FIELD | Flag.OUT_OF_BRIGHTNESS)
 #: Flags with which a position is still good, but less than its covariance says: light of a neighbour, or a
 #: window cut by the edge of the image, adds an error about as large as the noise.
 DOUBTFUL, DOUBT = int(Flag.NEIGHBOUR | Flag.WINDOW_CUT), 2.0
@@ -46,13 +48,16 @@ class Usable(NamedTuple):
         return Usable(*(part[keep] for part in self))  # type: ignore[arg-type]
 
 
-def usable(localizations: Localizations, available: Mask | None = None) -> Usable:
-    """The usable part of ``localizations``, of those ``available`` (n,) (None: all).
+def usable(localizations: Localizations, available: Mask | None = None, beyond: bool = False) -> Usable:
+    """The usable part of ``localizations``, of those ``available`` (n,) (None: all); also of what lies
+    ``beyond`` what the calibration was made for.
 
     Raises InputError where the arrays do not fit together.
     """
     _check_shapes(localizations)
     position, covariance, flags = localizations.position, localizations.covariance, localizations.flags
+    if beyond:
+        flags = flags & ~np.uint32(BEYOND)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     lateral = variance[:, 0] * variance[:, 1] - covariance[:, 0, 1] ** 2
     low, high = CREDIBLE[0] ** 2, CREDIBLE[1] ** 2

@@ -322,6 +322,20 @@ def test_doubtful_localizations_count_less():
     assert (pose.particle_id[flags > 0] >= 0).mean() > 0.9
 
 
+def test_what_the_calibration_was_not_made_for_is_left_out_unless_told_otherwise():
+    gear = SyntheticGear(Scene(), 8)
+    refusing, told = PoseEstimator(), PoseEstimator(PoseSettings(beyond_calibration=True))
+    for _ in range(4):
+        gear.advance()
+        seen, _ = gear.observe()
+        beyond = np.resize([Flag.OUT_OF_FIELD, Flag.OUT_OF_BRIGHTNESS, Flag.Z_OUT_OF_RANGE], len(seen))
+        seen = replace(seen, flags=beyond.astype(np.uint32))
+        pose = told.update(seen)
+        assert pose.valid
+        assert np.isfinite(pose.residual[pose.particle_id >= 0, 2]).mean() > 0.9
+        assert refusing.update(seen).particles_used < 0.4 * pose.particles_used
+
+
 @pytest.mark.parametrize("reference", ["map", "previous"])
 def test_learning_may_wait_until_the_pose_is_out(reference):
     """The same poses, whether ``learn`` is called after every update, or never."""

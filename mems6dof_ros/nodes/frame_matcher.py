@@ -49,6 +49,11 @@ class FrameMatcher:
         return any(stamp_ns == waiting for waiting, _, _ in self._waiting)
 
     @property
+    def lacks_last_image(self) -> bool:
+        """The image that the last info told of has not come."""
+        return self._last_info_ns in self._infos
+
+    @property
     def informed(self) -> bool:
         """True once an info has come."""
         return self._last_info_ns >= 0

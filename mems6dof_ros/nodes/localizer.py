@@ -195,8 +195,10 @@ class LocalizerNode(InstrumentNode):
 
     def _on_info(self, info: FrameInfo) -> None:
         stamp_ns = messages.nanoseconds(info.header.stamp)
+        # No frame overtakes one that is still on its way by the topic.
+        behind = self._by_topic and self._matcher.lacks_last_image
         self._matcher.add_info(stamp_ns, info)
-        image = self._shared.find(info.header, stamp_ns)
+        image = None if behind else self._shared.find(info.header, stamp_ns)
         if image and not self._matcher.has_image(stamp_ns):
             self._matcher.add_image(stamp_ns, image, time.time_ns())
             self._shared_stamps.append(stamp_ns)

@@ -275,17 +275,19 @@ def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
     return NodeSpec("monitor") if _truth(values, "monitor") else None
 
 
-def _tracking(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
-    """With the tracking that the argument asks for, where there is but one body to follow."""
-    if not _truth(values, "tracking") or values["bodies"]:
-        return nodes
-    tracking = {"tracking.enabled": True}
+def with_tracking(nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
+    """The ``nodes``, particles tracked and not searched in every frame."""
     return [
-        replace(node, parameters={**node.parameters, **tracking})
+        replace(node, parameters={**node.parameters, "tracking.enabled": True})
         if node.executable in ("localizer", "pipeline")
         else node
         for node in nodes
     ]
+
+
+def _tracking(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
+    """With the tracking that the argument asks for, where there is but one body to follow."""
+    return with_tracking(nodes) if _truth(values, "tracking") and not values["bodies"] else nodes
 
 
 def _respawning(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:

@@ -10,7 +10,6 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, at_least, at_most, information
 from mems6dof_ros.monitor.validation.browser import READY, Console, chromium, page_socket
 from mems6dof_ros.monitor.validation.nodes import DRIVE, monitor, namespace
-from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain, run_system, with_tracking
 from mems6dof_ros.nodes.watch import watch_poses
 from mems6dof_ros.recording import topics
 
@@ -150,12 +149,7 @@ def _tracking(material: Material, arrangement: str, rate: float) -> list[NodeSpe
         watched={topics.POSE_6DOF: "watch"},
         arrangement=arrangement,
     )
-    return [
-        replace(node, parameters={**node.parameters, "tracking.enabled": True})
-        if node.executable in ("pipeline", "localizer")
-        else node
-        for node in nodes
-    ]
+    return with_tracking(nodes)
 
 
 @contextlib.contextmanager

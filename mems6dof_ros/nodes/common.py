@@ -17,7 +17,6 @@ from types import FrameType
 from typing import Any
 
 import rclpy
-from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -55,24 +54,6 @@ WAIT_PARAMETER = Parameter(
 _FULL = 0.8
 #: Seconds of waiting for others after which it is a concern.
 _PATIENCE = 10.0
-
-
-class WhileRoom(CallbackGroup):
-    """For subscriptions that feed a worker: while its queue would block, their messages stay in the
-    middleware, and everything else the node does goes on."""
-
-    def __init__(self, worker: Worker[Any]) -> None:
-        super().__init__()
-        self._worker = worker
-
-    def can_execute(self, entity: Any) -> bool:
-        return self._worker.accepts()
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return self._worker.accepts()
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
 
 
 class InstrumentNode(ManagedNode):
@@ -135,8 +116,7 @@ class InstrumentNode(ManagedNode):
         """A worker until the node is deactivated, with the queue that the parameters describe, or of
         ``capacity``."""
         capacity = capacity or self.values["queue_size"]
-        wake = self.create_guard_condition(lambda: None)
-        self.worker = Worker(work, capacity, self.values["queue_policy"], wake.trigger)
+        self.worker = Worker(work, capacity, self.values["queue_policy"])
         self.health.gauge("queue", lambda: len(self.worker or ()))
         return self.worker
 

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
@@ -184,6 +185,7 @@ PARAMETERS = (
     *camera_parameters(),
 )
 
+_READERS_PATIENCE = 1.0  # s; longer than a loaded host takes to hand over a few frames
 _LONGEST_READ = 30.0  # s; a simulator renders a full frame in much less, a device answers within 1 s
 
 
@@ -205,6 +207,8 @@ class FrameSourceNode(InstrumentNode):
         self._state = State.WAITING
         self._in_flight: dict[int, float] = {}  # stamp in ns: when published, monotonic s
         self._schedule = Schedule()
+        self._sent_images = 0  # since all readers of the topic had all
+        self._readers_follow = True
         self._source: FrameSource | None = None
         self._ring: FrameRing | None = None
         self.create_service(Trigger, "~/start", self._on_start)
@@ -383,6 +387,7 @@ class FrameSourceNode(InstrumentNode):
         self._topics[topics.FRAME_INFO].publish(messages.to_rclpy(messages.frame_info(frame)))
         for publisher, message in made:
             publisher.publish(message)
+            self._sent_images += publisher is self._topics[topics.IMAGE]
         self.health.count("frames")
         if frame.frames_dropped:
             self.health.lost(frame.frames_dropped, f"the source lost {frame.frames_dropped} frames")
@@ -406,6 +411,7 @@ class FrameSourceNode(InstrumentNode):
         """Wait until ``frame`` may be published; False: it is not wanted any more."""
         if self.values["pacing"] == "consumer":
             self._wait_for_consumer(self.get_parameter("window").value - 1)
+            self._wait_for_readers()
         else:
             self._in_flight.clear()
         with self._changed:
@@ -449,6 +455,19 @@ class FrameSourceNode(InstrumentNode):
                 else:
                     del self._in_flight[stamp]
                     self.health.lost(1, f"nobody acknowledged the frame of {stamp} ns within {timeout:g} s")
+
+    def _wait_for_readers(self) -> None:
+        """Wait until who reads the topic of images, as a recorder does, has got all but the last few.
+
+        The consumer does not tell: it may have its frames by shared memory. A reader that hangs is waited for
+        once.
+        """
+        if self._sent_images < transport.FRAMES.depth // 2:
+            return
+        patience = Duration(seconds=_READERS_PATIENCE if self._readers_follow else 0.0)
+        self._readers_follow = self._topics[topics.IMAGE].wait_for_all_acked(patience)
+        if self._readers_follow:
+            self._sent_images = 0
 
     def _on_acknowledged(self, data: bytes) -> None:
         with self._changed:

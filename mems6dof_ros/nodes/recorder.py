@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.common import InstrumentNode, WhileRoom, run
+from mems6dof_ros.nodes.common import InstrumentNode, run
 from mems6dof_ros.nodes.parameter_files import ParameterReader, parameter_file
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
@@ -55,6 +55,9 @@ KNOWN_TYPES = {
 }
 #: Recorded unless asked otherwise: everything but the images, which need the disk's own rate.
 DEFAULT_TOPICS = tuple(name for name in KNOWN_TYPES if name != topics.IMAGE)
+
+#: More than their publisher keeps: what it takes for acknowledged waits here until it is taken.
+_IMAGES = QoSProfile(depth=3 * transport.FRAMES.depth)
 
 #: A message of one of these types completes a motion cycle, upon which what has been recorded so far is
 #: flushed: of those that come, the first in this order.
@@ -150,14 +153,15 @@ class RecorderNode(InstrumentNode):
         self.start_worker(lambda act: act(), capacity)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._channels: list[Channel] = []
+        self._stream = self.make_stream(tick=self._look_for_types)
         self._unknown = [name for name in self.values["topics"] if not self._subscribe_known(name)]
-        if self._unknown:
-            self._looking = self.create_timer(0.2, self._look_for_types, clock=steady)
+        self._stream.begin()
         self.create_timer(1.0, self._on_second, clock=steady)
         self.tell("recording" if self._bag else "stopped")
 
     def deactivate(self) -> None:
         assert self.worker is not None
+        self._stream.ask_to_end()
         self.worker.end(timeout=None)  # a slow disk is no reason to lose a record; a second signal is
         super().deactivate()
         bag, self._bag = self._bag, None
@@ -178,12 +182,15 @@ class RecorderNode(InstrumentNode):
     def _subscribe_known(self, name: str) -> bool:
         if name not in KNOWN_TYPES:
             return False
-        qos = transport.FRAMES if KNOWN_TYPES[name].endswith("/Image") else transport.MESSAGES
-        self._subscribe(name, KNOWN_TYPES[name], qos)
+        self._subscribe(
+            name, KNOWN_TYPES[name], _IMAGES if "Image" in KNOWN_TYPES[name] else transport.MESSAGES
+        )
         return True
 
     def _look_for_types(self) -> None:
         """Subscribe to what has appeared, in the way it is published."""
+        if not self._unknown:
+            return
         types = dict(self.get_topic_names_and_types())
         for name in list(self._unknown):
             resolved = self.resolve_topic_name(name)
@@ -200,8 +207,6 @@ class RecorderNode(InstrumentNode):
                 self._subscribe(name, types[resolved][0], qos)
             except (InputError, ImportError, AttributeError) as error:
                 self.health.refused(f"topic {resolved} cannot be recorded: {error}")
-        if not self._unknown:
-            self._looking.cancel()
 
     def _subscribe(self, name: str, typename: str, qos: QoSProfile) -> None:
         definition(typename)  # fails here rather than with the first message
@@ -217,9 +222,7 @@ class RecorderNode(InstrumentNode):
         channel = Channel(self.resolve_topic_name(name), typename, (offered,))
         self._channels.append(channel)
         receive = functools.partial(self._on_message, channel)
-        assert self.worker is not None
-        group = WhileRoom(self.worker)
-        self.create_subscription(message_type, name, receive, qos, raw=True, callback_group=group)
+        self._stream.subscribe(message_type, name, receive, qos, raw=True, informed=True)
 
     def _on_message(self, channel: Channel, data: bytes, info: dict[str, Any]) -> None:
         assert self.worker is not None

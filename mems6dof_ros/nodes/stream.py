@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.guard_condition import GuardCondition
@@ -30,6 +30,12 @@ class OutOfExecutor(CallbackGroup):
         pass
 
 
+class _Subscribed(NamedTuple):
+    subscription: Any
+    act: Callable[..., None]
+    informed: bool
+
+
 class Stream:
     """Waits for a few topics only and calls back in its own thread; ``subscribe``, ``begin``, ``end``. What
     is called back may ``subscribe`` and ``unsubscribe`` too.
@@ -50,7 +56,7 @@ class Stream:
     ) -> None:
         self._node, self._failed, self._tick, self._period = node, failed, tick, period
         self._group = OutOfExecutor()
-        self._subscriptions: list[tuple[Any, Callable[[Any], None]]] = []
+        self._subscriptions: list[_Subscribed] = []
         self._changed = False
         self._wake = GuardCondition(None, None, context=node.context)
         self._ending = False
@@ -60,24 +66,27 @@ class Stream:
         self,
         kind: type,
         topic: str,
-        act: Callable[[Any], None],
+        act: Callable[..., None],
         quality: QoSProfile = transport.MESSAGES,
         raw: bool = False,
+        informed: bool = False,
     ) -> None:
-        """Call ``act`` with each message, ``raw``: serialized. Of what has arrived together, the topic that
-        was subscribed to first comes first. The node destroys the subscription."""
+        """Call ``act`` with each message, ``raw``: serialized, ``informed``: and with rclpy's dict about it.
+        Of what has arrived together, the topic that was subscribed to first comes first. The node destroys
+        the subscription."""
         subscription = self._node.create_subscription(
             kind, topic, act, quality, callback_group=self._group, raw=raw
         )
-        self._subscriptions.append((subscription, subscription.callback))  # refuses what act refuses
+        # The subscription's own callback refuses what act refuses.
+        self._subscriptions.append(_Subscribed(subscription, subscription.callback, informed))
         self._changed = True
 
     def unsubscribe(self, topic: str) -> None:
         """Take no more messages of ``topic``."""
         name = self._node.resolve_topic_name(topic)
-        for each in [each for each in self._subscriptions if each[0].topic_name == name]:
+        for each in [each for each in self._subscriptions if each.subscription.topic_name == name]:
             self._subscriptions.remove(each)
-            self._node.destroy_subscription(each[0])
+            self._node.destroy_subscription(each.subscription)
         self._changed = True
 
     def begin(self) -> None:
@@ -103,11 +112,11 @@ class Stream:
         except BaseException as error:  # handed to the main thread, which ends the node
             self._failed(error)
 
-    def _wait_for(self, subscriptions: list[tuple[Any, Callable[[Any], None]]]) -> None:
+    def _wait_for(self, subscriptions: list[_Subscribed]) -> None:
         """Take what comes, until there is something else to wait for."""
         self._changed = False
         with ExitStack() as held:
-            handles = [subscription.handle for subscription, _ in subscriptions]
+            handles = [each.subscription.handle for each in subscriptions]
             guard, context = self._wake.handle, self._node.context.handle
             for handle in (*handles, guard, context):
                 held.enter_context(handle)
@@ -123,12 +132,12 @@ class Stream:
                     self._tick()
                     self._ticked = time.monotonic()
 
-    def _take(self, subscriptions: list[tuple[Any, Callable[[Any], None]]]) -> None:
-        for subscription, act in subscriptions:
+    def _take(self, subscriptions: list[_Subscribed]) -> None:
+        for subscription, act, informed in subscriptions:
             while not self._ending:
                 found = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if found is None:
                     break
-                act(found[0])
+                act(*found) if informed else act(found[0])
                 if self._changed:
                     return

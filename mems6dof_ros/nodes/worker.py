@@ -17,9 +17,8 @@ class Worker(Generic[Item]):
     """A thread that takes items out of a bounded queue and calls ``work`` with each.
 
     Callbacks only ``put``. ``policy`` when the items that wait would exceed ``capacity``, in the unit of
-    their sizes: ``block`` until there is room, or ``drop_oldest`` and count them in ``dropped``. ``on_room``
-    is called when an item has been taken out of a full queue. An exception of ``work`` ends the thread and is
-    kept in ``failure``.
+    their sizes: ``block`` until there is room, or ``drop_oldest`` and count them in ``dropped``. An
+    exception of ``work`` ends the thread and is kept in ``failure``.
     """
 
     def __init__(
@@ -27,11 +26,10 @@ class Worker(Generic[Item]):
         work: Callable[[Item], None],
         capacity: int,
         policy: Literal["block", "drop_oldest"] = "block",
-        on_room: Callable[[], None] = lambda: None,
     ) -> None:
         self.dropped = 0
         self.failure: BaseException | None = None
-        self._work, self._capacity, self._policy, self._on_room = work, capacity, policy, on_room
+        self._work, self._capacity, self._policy = work, capacity, policy
         self._items: deque[tuple[Item, int]] = deque()
         self._waiting = 0  # sizes of the items
         self._changed = threading.Condition()
@@ -46,10 +44,6 @@ class Worker(Generic[Item]):
     def fill(self) -> float:
         """Fraction of the capacity that is taken."""
         return self._waiting / self._capacity
-
-    def accepts(self) -> bool:
-        """False while ``put`` would block."""
-        return self._policy != "block" or self._ending or self._waiting < self._capacity
 
     def put(self, item: Item, size: int = 1) -> None:
         """Append ``item``, see ``policy``; ignored once the worker has ended.
@@ -92,12 +86,9 @@ class Worker(Generic[Item]):
                     self._changed.wait_for(lambda: self._items or self._ending)
                     if self._ending:
                         return
-                    was_full = self._waiting >= self._capacity
                     item = self._take()
                     self._busy = True
                     self._changed.notify_all()
-                if was_full:
-                    self._on_room()
                 self._work(item)
                 with self._changed:
                     self._busy = False

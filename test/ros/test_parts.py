@@ -119,23 +119,6 @@ def test_worker_blocks_instead_of_losing() -> None:
     assert (done, worker.dropped) == (list(range(200)), 0)
 
 
-def test_worker_tells_when_there_is_room() -> None:
-    gate, room = threading.Semaphore(0), threading.Event()
-    worker = Worker(lambda _: gate.acquire(), capacity=1, on_room=room.set)
-    worker.put(0)
-    while len(worker):  # until the worker holds the first one
-        pass
-    assert worker.accepts()
-    worker.put(1)
-    assert not worker.accepts()
-    room.clear()
-    gate.release()
-    assert room.wait(10)
-    assert worker.accepts()
-    gate.release()
-    worker.end()
-
-
 def test_worker_that_fails_blocks_nobody() -> None:
     def work(item: int) -> None:
         raise ZeroDivisionError

@@ -93,13 +93,13 @@ def slow(work: Path, seed: int, seconds: float) -> Iterator[Figure]:
 
 
 def beside(work: Path, seed: int, seconds: float) -> Iterator[Figure]:
-    """A recorder of everything, frames too, beside a run to its end, in files of two seconds."""
+    """A recorder of everything, frames too, beside a run to its end, in files of half a second."""
     cycles = round(RATE * seconds)
     paced = {"pacing": "consumer", "acknowledged_by": topics.POSE_6DOF, "simulator.cycles": cycles}
     source = NodeSpec("frame_source", {**_simulated(seed), **paced}, ends_system=True)
     recorded = [*DEFAULT_TOPICS, topics.IMAGE]
     nodes = chain(source, calibration="", output=str(work / "bag"), recorded=recorded)
-    nodes = [_with(node, "recorder", split_duration=2.0) for node in with_camera(nodes, _settings(seed))]
+    nodes = [_with(node, "recorder", split_duration=0.5) for node in with_camera(nodes, _settings(seed))]
     work.mkdir(parents=True)
     with run_system(nodes, namespace=f"disk_{os.getpid()}", on_line=lambda line: None) as system:
         system.wait("frame_source", timeout=300.0)
@@ -109,7 +109,7 @@ def beside(work: Path, seed: int, seconds: float) -> Iterator[Figure]:
     yield exactly("beside a run: nodes that failed", sum(map(bool, codes.values())), 0)
     yield exactly("beside a run: frames recorded", recording.frames, cycles)
     yield exactly("beside a run: poses recorded", sum(map(len, recording.poses.values())), cycles)
-    yield at_least("beside a run: files of two seconds", files, 2)
+    yield at_least("beside a run: files of half a second", files, 2)
     yield exactly("beside a run: problems that check names", len(check_bag(work / "bag").problems), 0)
 
 

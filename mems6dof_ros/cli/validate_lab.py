@@ -16,9 +16,9 @@ from mems6dof_ros.figures import Figure, exactly
 #: Part to the module that measures it by ``figures(work: Path, seed: int, tell: Callable[[str], None])``: it
 #: works in the directory ``work``, tells what it is doing, and yields rows of the table.
 PARTS = {
-    "messages": "mems6dof_ros.nodes.hostile",
-    "outages": "mems6dof_ros.nodes.outages",
-    "network": "mems6dof_ros.nodes.networks",
+    "messages": "mems6dof_ros.nodes.validation.hostile",
+    "outages": "mems6dof_ros.nodes.validation.outages",
+    "network": "mems6dof_ros.nodes.validation.networks",
     "bags": "mems6dof_ros.recording.validation.bags",
     "crash": "mems6dof_ros.recording.validation.crash",
     "disk": "mems6dof_ros.recording.validation.disk",

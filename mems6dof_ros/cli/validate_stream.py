@@ -27,7 +27,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print the table; 1 where a figure misses its requirement."""
-    from mems6dof_ros.nodes.validation import figures
+    from mems6dof_ros.nodes.validation.stream import figures
     from mems6dof_ros.simulation.settings import SimulationSettings
 
     settings = SimulationSettings(seed=args.seed, optics_seed=args.seed)

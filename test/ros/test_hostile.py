@@ -8,7 +8,7 @@ import pytest
 from peers import SMALL_GEAR
 
 from mems6dof_ros.figures import Figure
-from mems6dof_ros.nodes import hostile
+from mems6dof_ros.nodes.validation import hostile
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 SETTINGS = SimulationSettings(**SMALL_GEAR)

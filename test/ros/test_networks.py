@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from peers import SMALL_GEAR
 
-from mems6dof_ros.nodes.networks import across_machines, why_not
+from mems6dof_ros.nodes.validation.networks import across_machines, why_not
 
 
 def test_frames_cross_a_network(tmp_path: Path) -> None:

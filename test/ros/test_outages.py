@@ -6,7 +6,7 @@ from pathlib import Path
 
 from peers import SMALL_GEAR
 
-from mems6dof_ros.nodes.outages import outages
+from mems6dof_ros.nodes.validation.outages import outages
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, between, exactly, figure, information, remark
 from mems6dof_ros.frame import Frame
-from mems6dof_ros.nodes import camera_validation
+from mems6dof_ros.nodes.validation import cameras as nodes
 from mems6dof_ros.sources.cameras.basler import BaslerSource
 from mems6dof_ros.sources.cameras.camera import CameraSource
 from mems6dof_ros.sources.cameras.emulation import GigeEmulator, WireCounter, basler_emulator
@@ -33,7 +33,7 @@ def figures(
     The emulators give what the machine can. One that is not installed is one row without a verdict.
     """
     parts = {"GigE": gige_stream, "GigE lossy": gige_losses, "GigE replug": gige_restart, "Basler": basler}
-    parts |= {"GigE, nodes": camera_validation.gige, "Basler, nodes": camera_validation.poses}
+    parts |= {"GigE, nodes": nodes.gige, "Basler, nodes": nodes.poses}
     table: list[Figure] = []
     for k, (name, part) in enumerate(parts.items()):
         progress(k, len(parts), name)

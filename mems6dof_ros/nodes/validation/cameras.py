@@ -16,9 +16,9 @@ from std_srvs.srv import Trigger
 from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
 from mems6dof_ros.figures import Figure, exactly, figure, information
 from mems6dof_ros.nodes import transport
-from mems6dof_ros.nodes.bystander import Bystander, running
-from mems6dof_ros.nodes.hostile import calibrate_quickly
 from mems6dof_ros.nodes.system import NodeSpec, chain
+from mems6dof_ros.nodes.validation.bystander import Bystander, running
+from mems6dof_ros.nodes.validation.hostile import calibrate_quickly
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.simulation.experiment import motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings

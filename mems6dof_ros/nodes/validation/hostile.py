@@ -29,10 +29,10 @@ from mems6dof_ros.figures import Figure, at_most, exactly, information
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
 from mems6dof_ros.localization.localizer import Localizer
-from mems6dof_ros.nodes import broken
 from mems6dof_ros.nodes.actuation import ANSWERS
-from mems6dof_ros.nodes.bystander import running
 from mems6dof_ros.nodes.system import NodeSpec, chain, commanded
+from mems6dof_ros.nodes.validation import broken
+from mems6dof_ros.nodes.validation.bystander import running
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages, topics

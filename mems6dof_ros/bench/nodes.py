@@ -168,7 +168,7 @@ def _duration(material: Material, sustained: bool = False) -> float:
 
 
 def _bare(material: Material, rate: float) -> Series:
-    from mems6dof_ros.nodes.system import run_system
+    from mems6dof_ros.nodes.runner import run_system
 
     source = frame_source(material, rate, topics.LOCALIZATIONS)
     waiting = {**source.parameters, "wait_for_subscribers": [f"{topics.IMAGE}:1"]}
@@ -207,7 +207,8 @@ def _chain(
     cycles: int = 0,
 ) -> Series:
     from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
-    from mems6dof_ros.nodes.system import chain, run_system
+    from mems6dof_ros.nodes.runner import run_system
+    from mems6dof_ros.nodes.system import chain
 
     nodes = chain(
         frame_source(material, rate, topics.POSE_6DOF),

@@ -34,7 +34,8 @@ FILES = 9
 def soak(minutes: float, work: Path, tell: Callable[[str], None]) -> Iterator[Figure]:
     """Rows of `mems6dof validate lab --soak MINUTES`; ``work``: a directory on a disk with room for 0.4 GB of
     localizations a minute. Raises Mems6dofError where a node ends before its time."""
-    from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
+    from mems6dof_ros.nodes.runner import run_system
+    from mems6dof_ros.nodes.system import NodeSpec, chain
 
     material = Material(work, quick=True)
     tell("calibrating")

@@ -141,7 +141,8 @@ def measure(settings: SimulationSettings, cycles: int, calibration: Path, out: P
     fails."""
     from mems6dof_ros.cli.progress import Progress
     from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
-    from mems6dof_ros.nodes.system import NodeSpec, chain, run_system, simulated
+    from mems6dof_ros.nodes.runner import run_system
+    from mems6dof_ros.nodes.system import NodeSpec, chain, simulated
     from mems6dof_ros.nodes.watch import watch_poses
     from mems6dof_ros.recording import topics
 

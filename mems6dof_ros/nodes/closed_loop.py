@@ -16,7 +16,8 @@ from mems6dof_ros.control.position import DriveSettings
 from mems6dof_ros.control.validation import Move
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes.loop_client import WATCHED, LoopClient, loop_client, psi_truth
-from mems6dof_ros.nodes.system import NodeSpec, RunningSystem, chain, commanded, run_system
+from mems6dof_ros.nodes.runner import RunningSystem, run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain, commanded
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.messages import nanoseconds
 from mems6dof_ros.simulation.settings import SimulationSettings

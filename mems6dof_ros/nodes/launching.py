@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.nodes.common import PARENT_VARIABLE
-from mems6dof_ros.nodes.system import NodeSpec, RunningSystem, System, given
+from mems6dof_ros.nodes.runner import RunningSystem
+from mems6dof_ros.nodes.system import NodeSpec, System, given
 
 
 def description(system: System) -> Any:

@@ -17,7 +17,8 @@ from mems6dof_ros.calibration.focus_stack import measure_stack
 from mems6dof_ros.cli.closed_loop import run_closed_loop
 from mems6dof_ros.nodes.closed_loop import approach, closed_loop, data_sheet, safe_stops
 from mems6dof_ros.nodes.loop_client import stages
-from mems6dof_ros.nodes.system import NodeSpec, command
+from mems6dof_ros.nodes.runner import command
+from mems6dof_ros.nodes.system import NodeSpec
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.simulation.experiment import focus_stack

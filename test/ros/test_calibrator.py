@@ -20,7 +20,8 @@ from mems6dof_ros.calibration.focus_stack import measure_stack
 from mems6dof_ros.cli.main import main
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes.calibration_client import request_calibration
-from mems6dof_ros.nodes.system import NodeSpec, command
+from mems6dof_ros.nodes.runner import command
+from mems6dof_ros.nodes.system import NodeSpec
 from mems6dof_ros.recording.frames import camera_to_json
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise

@@ -18,7 +18,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from mems6dof_msgs.msg import Localizations, Pose6DOF
-from mems6dof_ros.nodes.system import NodeSpec, command, simulated
+from mems6dof_ros.nodes.runner import command
+from mems6dof_ros.nodes.system import NodeSpec, simulated
 from mems6dof_ros.recording.bag import BagReader
 
 Start = Callable[..., NodeProcess]

@@ -15,7 +15,8 @@ from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
-from mems6dof_ros.nodes.system import SYSTEMS, chain, run_system, simulated
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import SYSTEMS, chain, simulated
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.sources.source import frames, open_source

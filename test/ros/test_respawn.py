@@ -9,8 +9,9 @@ from pathlib import Path
 
 from peers import alive, wait_until
 
+from mems6dof_ros.nodes.runner import run_system
 from mems6dof_ros.nodes.shared_memory import remove_abandoned
-from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, run_system
+from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec
 
 
 def test_only_segments_of_dead_processes_are_removed(tmp_path: Path) -> None:

@@ -24,7 +24,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS, KNOWN_TYPES
-from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, chain, run_system
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, chain
 
 NODES = ("frame_source", "localizer", "pose_estimator", "recorder", "calibrator")
 TOPICS = ("image_raw", "camera_info", "frame_info", "truth", "localizations", "pose_6dof", "pose")

@@ -17,7 +17,8 @@ from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.analysis.truth import compare
 from mems6dof_ros.calibration.file import load_calibration
-from mems6dof_ros.nodes.system import chain, run_system, simulated
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import chain, simulated
 from mems6dof_ros.pose.bodies import relative_pose
 from mems6dof_ros.pose.bodies_file import load_bodies
 from mems6dof_ros.pose.field import FieldError

@@ -17,7 +17,8 @@ from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
-from mems6dof_ros.nodes.system import SYSTEMS, RunningSystem, chain, command, run_system, simulated
+from mems6dof_ros.nodes.runner import RunningSystem, command, run_system
+from mems6dof_ros.nodes.system import SYSTEMS, chain, simulated
 from mems6dof_ros.pose.cycle_pose import Status
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages
@@ -181,7 +182,8 @@ def test_nodes_do_not_survive_a_killed_runner(tmp_path: Path) -> None:
     script = tmp_path / "runner.py"
     script.write_text(
         "import json, time\n"
-        "from mems6dof_ros.nodes.system import NodeSpec, run_system\n"
+        "from mems6dof_ros.nodes.runner import run_system\n"
+        "from mems6dof_ros.nodes.system import NodeSpec\n"
         "nodes = [NodeSpec('pose_estimator'), NodeSpec('recorder', {'start_paused': True})]\n"
         "with run_system(nodes) as system:\n"
         "    print(json.dumps([p.pid for p in system.processes.values()]), flush=True)\n"

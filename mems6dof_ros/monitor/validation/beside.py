@@ -21,7 +21,8 @@ from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, at_least, at_most, information
 from mems6dof_ros.monitor.validation.browser import READY, Console, chromium, page_socket
 from mems6dof_ros.monitor.validation.nodes import DRIVE, monitor, namespace
-from mems6dof_ros.nodes.system import NodeSpec, chain, run_system, with_tracking
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain, with_tracking
 from mems6dof_ros.nodes.watch import watch_poses
 from mems6dof_ros.recording import topics
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.errors import Mems6dofError
-from mems6dof_ros.nodes.system import NodeSpec, run_system
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import NodeSpec
 
 #: Cycles per second of the drive.
 DRIVE = 90.0

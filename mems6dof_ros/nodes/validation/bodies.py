@@ -9,7 +9,8 @@ from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.analysis.relative import relative_motion
 from mems6dof_ros.analysis.truth import compare
 from mems6dof_ros.figures import Figure, between, exactly, information
-from mems6dof_ros.nodes.system import chain, run_system, simulated
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import chain, simulated
 from mems6dof_ros.simulation.settings import SimulationSettings
 
 #: Both wholly in the field, about 40 particles each; the second is driven as the ring gear is.

@@ -23,7 +23,8 @@ from sensor_msgs.msg import Image
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.actuation import ANSWERS
-from mems6dof_ros.nodes.system import NodeSpec, RunningSystem, run_system
+from mems6dof_ros.nodes.runner import RunningSystem, run_system
+from mems6dof_ros.nodes.system import NodeSpec
 
 _PATIENCE = 300.0  # s
 

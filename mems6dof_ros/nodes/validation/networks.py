@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from mems6dof_ros.figures import Figure, between, exactly, information, remark
-from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.simulation.settings import SimulationSettings

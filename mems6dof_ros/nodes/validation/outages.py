@@ -31,7 +31,8 @@ from mems6dof_ros.figures import Figure, at_most, exactly, information
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.closed_loop import PATIENT, data_sheet
 from mems6dof_ros.nodes.loop_client import WATCHED, loop_client
-from mems6dof_ros.nodes.system import NodeSpec, RunningSystem, chain, commanded, run_system
+from mems6dof_ros.nodes.runner import RunningSystem, run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain, commanded
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.recording.recover import recover

@@ -17,7 +17,8 @@ from mems6dof_ros.cli.demo import BODY, REQUIREMENTS, measure, prepare
 from mems6dof_ros.figures import Figure, at_most, exactly
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.localization.validation import matched_fits
-from mems6dof_ros.nodes.system import chain, replayed, run_system
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import chain, replayed
 from mems6dof_ros.nodes.validation.bodies import bodies_figures
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.simulation.settings import SimulationSettings

@@ -20,7 +20,8 @@ from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, at_least, at_most, exactly
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.localizer import Localizer
-from mems6dof_ros.nodes.system import NodeSpec, chain, replayed, run_system
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain, replayed
 from mems6dof_ros.nodes.validation.hostile import calibrate_quickly
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages, topics

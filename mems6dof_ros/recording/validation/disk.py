@@ -18,7 +18,8 @@ from mems6dof_ros.analysis.recording import load_recording
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, at_least, exactly, information, remark
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
-from mems6dof_ros.nodes.system import NodeSpec, chain, run_system
+from mems6dof_ros.nodes.runner import run_system
+from mems6dof_ros.nodes.system import NodeSpec, chain
 from mems6dof_ros.nodes.validation.bystander import Bystander
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import BagReader

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from mems6dof_ros.bench.material import CYCLES, Material
+from mems6dof_ros.bench.processes import memory_of, processor_seconds
 from mems6dof_ros.bench.table import Row
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.recording import messages, topics
@@ -35,7 +36,8 @@ WARM_UP = 4 * CYCLES
 @dataclass(frozen=True)
 class Series:
     """What came out: ``rate`` 1/s; ``latency`` (n,) s from publication of a frame to that of the result;
-    ``lost`` frames; by node, ``processor`` ms per cycle, and ``memory`` (samples,) MiB."""
+    ``lost`` frames; by node, ``processor`` ms per cycle, and ``memory`` (samples,) of
+    its own, MiB."""
 
     rate: float
     latency: np.ndarray
@@ -304,7 +306,7 @@ def _measure(
 
     wait(lambda: len(received) >= WARM_UP, START)
     begin, first = time.monotonic(), len(received)
-    before = {name: _processor_seconds(pid) for name, pid in processes.items()}
+    before = {name: processor_seconds(pid) for name, pid in processes.items()}
     memory: dict[str, list[float]] = {name: [] for name in processes}
     sampled = begin - 1.0
 
@@ -313,11 +315,11 @@ def _measure(
         if time.monotonic() - sampled > 0.5:
             sampled = time.monotonic()
             for name, pid in processes.items():
-                memory[name].append(resident_memory(pid))
+                memory[name].append(memory_of(pid).own)
         return len(received) - first >= cycles if cycles else time.monotonic() - begin >= duration
 
     wait(done, max(60.0 + duration, cycles / 2))
-    after = {name: _processor_seconds(pid) for name, pid in processes.items()}
+    after = {name: processor_seconds(pid) for name, pid in processes.items()}
     chosen = received[first:]
     latency, counters = zip(*(_read(data, topic) for _, data in chosen), strict=True)
     return Series(
@@ -337,17 +339,6 @@ def _read(data: bytes, topic: str) -> tuple[float, int]:
     found = messages.deserialize(data, "mems6dof_msgs/msg/Localizations")
     spent = messages.nanoseconds(found.publication_time) - messages.nanoseconds(found.frame_publication_time)
     return spent * 1e-9, int(found.frame_counter)
-
-
-def _processor_seconds(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def resident_memory(pid: int) -> float:
-    """Resident memory, MiB."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def _disk_rate(directory: Path, size_mb: int) -> float:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from mems6dof_ros.bench.material import Material
 from mems6dof_ros.bench.nodes import START, frame_source
+from mems6dof_ros.bench.processes import Memory, memory_of
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.figures import Figure, at_least, at_most, exactly, information
 from mems6dof_ros.pose.cycle_pose import Status
@@ -97,24 +96,6 @@ def soak(minutes: float, work: Path, tell: Callable[[str], None]) -> Iterator[Fi
     yield exactly("nodes that did not end in good order", sum(code != 0 for code in codes.values()), 0)
     for name, samples in memory.items():
         yield from _flatness(name, samples, 60 * minutes)
-
-
-class Memory(NamedTuple):
-    """Resident memory of a process, MiB: its ``own``, and what it has touched of ``shared`` segments of fixed
-    size."""
-
-    own: float
-    shared: float
-
-
-def memory_of(process: int) -> Memory:
-    """Of a process id."""
-    text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
-    own, shared = (int(re.findall(rf"^{name}:\s+(\d+) kB", text, re.MULTILINE)[0]) / 1024 for name in _KINDS)
-    return Memory(own, shared)
-
-
-_KINDS = ("RssAnon", "RssShmem")
 
 
 def _flatness(name: str, samples: Sequence[Memory], seconds: float) -> Iterator[Figure]:

@@ -10,16 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from mems6dof_ros.bench.processes import memory_of, processor_seconds
 from mems6dof_ros.figures import Figure, at_least, at_most, exactly, information
 from mems6dof_ros.monitor.validation import browser
-from mems6dof_ros.monitor.validation.nodes import (
-    DRIVE,
-    memory,
-    monitor,
-    namespace,
-    processor_seconds,
-    synthetic,
-)
+from mems6dof_ros.monitor.validation.nodes import DRIVE, monitor, namespace, synthetic
 
 
 def measure(
@@ -56,7 +50,8 @@ def measure(
             inspector.send("HeapProfiler.collectGarbage")
             metrics = {m["name"]: m["value"] for m in inspector.send("Performance.getMetrics")["metrics"]}
             heap, nodes = metrics["JSHeapUsedSize"] / 1e6, metrics["Nodes"]
-            samples.append((heap, sum(map(memory, renderers)), memory(pid), statistics.median(lags), nodes))
+            rendering, serving = sum(memory_of(one).own for one in renderers), memory_of(pid).own
+            samples.append((heap, rendering, serving, statistics.median(lags), nodes))
         passed = time.monotonic() - start
         busy = processor_seconds(pid) - spent[0], sum(map(processor_seconds, renderers)) - spent[1]
         cycles = shown.evaluate(
@@ -71,8 +66,8 @@ def measure(
     yield at_least(f"{minutes}: cycles that reached the page per second", shown_rate, 0.98 * DRIVE)
     yield exactly(f"{minutes}: cycles missing in the page", int(np.sum(np.diff(cycles) != 1)), 0)
     yield at_most(f"{minutes}: growth of the page's heap, MB, of {early[0]:.1f}", heap, 2.0)
-    yield at_most(f"{minutes}: growth of the renderer's memory, MB, of {early[1]:.0f}", renderer, 20.0)
-    yield at_most(f"{minutes}: growth of the node's memory, MB, of {early[2]:.0f}", node, 5.0)
+    yield at_most(f"{minutes}: growth of the renderer's memory, MiB, of {early[1]:.0f}", renderer, 20.0)
+    yield at_most(f"{minutes}: growth of the node's memory, MiB, of {early[2]:.0f}", node, 5.0)
     yield at_most(f"{minutes}: growth of the elements of the page, of {early[4]:.0f}", elements, 50)
     yield at_most(f"{minutes}: growth of the lag, ms, of {early[3] * 1e3:.0f}", lag * 1e3, 20.0)
     yield information("processor time of the monitor node per cycle, ms", busy[0] / passed / DRIVE * 1e3)

@@ -1,13 +1,11 @@
-"""Nodes of a validation, each a process of its own, and what it costs."""
+"""Nodes of a validation, each a process of its own."""
 
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.errors import Mems6dofError
@@ -54,17 +52,3 @@ def node(spec: NodeSpec, namespace: str, says: str = "") -> Iterator[tuple[str, 
 def synthetic(namespace: str, **parameters: Any) -> contextlib.AbstractContextManager[tuple[str, int]]:
     """The traffic of an instrument, as a node."""
     return node(NodeSpec("synthetic_gear", parameters), namespace, "active")
-
-
-def processor_seconds(pid: int) -> float:
-    """That a process has used so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def memory(pid: int) -> float:
-    """Resident memory that is not a file's, MB."""
-    for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
-        if line.startswith("RssAnon:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return math.nan

@@ -352,6 +352,7 @@ class FrameSourceNode(InstrumentNode):
             return
         self._playing = False
         self._wait_for_consumer(0)
+        self._wait_for_readers(0)
         self._set_state(State.ENDED)
 
     def _tell_of_silence(self, error: TimeoutError) -> None:
@@ -411,7 +412,7 @@ class FrameSourceNode(InstrumentNode):
         """Wait until ``frame`` may be published; False: it is not wanted any more."""
         if self.values["pacing"] == "consumer":
             self._wait_for_consumer(self.get_parameter("window").value - 1)
-            self._wait_for_readers()
+            self._wait_for_readers(transport.FRAMES.depth // 2)
         else:
             self._in_flight.clear()
         with self._changed:
@@ -456,13 +457,13 @@ class FrameSourceNode(InstrumentNode):
                     del self._in_flight[stamp]
                     self.health.lost(1, f"nobody acknowledged the frame of {stamp} ns within {timeout:g} s")
 
-    def _wait_for_readers(self) -> None:
-        """Wait until who reads the topic of images, as a recorder does, has got all but the last few.
+    def _wait_for_readers(self, in_flight: int) -> None:
+        """Wait until who reads the topic of images, as a recorder does, has got all but ``in_flight``.
 
         The consumer does not tell: it may have its frames by shared memory. A reader that hangs is waited for
         once.
         """
-        if self._sent_images < transport.FRAMES.depth // 2:
+        if self._sent_images <= in_flight:
             return
         patience = Duration(seconds=_READERS_PATIENCE if self._readers_follow else 0.0)
         self._readers_follow = self._topics[topics.IMAGE].wait_for_all_acked(patience)

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from mems6dof_msgs.msg import Pose6DOF
 from mems6dof_ros.analysis.check import check_bag
 from mems6dof_ros.recording.bag import BagReader
+from mems6dof_ros.recording.validation import disk
 from mems6dof_ros.recording.validation.crash import die
 from mems6dof_ros.recording.validation.processes import traffic, witnessed_recorder
 
@@ -178,3 +179,9 @@ def test_a_slow_disk_loses_what_it_counts(peer: Peer, tmp_path: Path) -> None:
     with BagReader(output) as bag:
         assert sum(bag.counts.values()) == messages - lost
         assert sum(1 for _ in bag.messages()) == messages - lost
+
+
+def test_a_run_waits_for_who_records_its_images(domain: int, tmp_path: Path) -> None:
+    """Though the localizer, and so the pose, has them by shared memory."""
+    figures = list(disk.beside(tmp_path / "beside", seed=1, seconds=8.0))
+    assert not [figure for figure in figures if figure["passed"] is False], figures

@@ -29,6 +29,7 @@ def search_defocus(
     measured: Array,
     noise: Array,
     local: Array,
+    inflation: Array,
     limits: NDArray[np.int64],
     grid: Array,
     basis: Array,
@@ -38,6 +39,7 @@ def search_defocus(
     """Best and second-best defocus of n particles from k features.
 
     ``measured`` (n, k), ``noise`` (n, k, k); ``local`` (n, k, m): coefficients of each particle's curves;
+    ``inflation`` (n, k): of the standard deviations in ``scatter``, for each particle;
     ``limits`` (n, 2): first and last grid point to consider;
     ``grid`` (g,) m, equidistant, with ``basis`` and ``slope_basis`` (g, m): the polynomials there and
     their derivatives per grid step; ``scatter`` (g, k, k). Between grid points basis and scatter are
@@ -67,7 +69,7 @@ def search_defocus(
         for a in range(k):
             for g in range(points):
                 residuals[a, g] = measured[i, a] - curve[a, g]
-        _levels(noise[i], scatter_of, residuals, factors, level)
+        _levels(noise[i], scatter_of, inflation[i], residuals, factors, level)
         for g in range(first, last + 1):
             if (g > first and level[g] >= level[g - 1]) or (g < last and level[g] > level[g + 1]):
                 continue
@@ -85,8 +87,8 @@ def search_defocus(
                     residual[a] = measured[i, a] - (y0 + t * (d0 + t * (c2 + t * c3)))
                     tangent[a] = d0 + t * (2 * c2 + 3 * t * c3)
                     for b in range(a + 1):
-                        factor[a, b] = (
-                            noise[i, a, b] + (1 - t) * scatter[left, a, b] + t * scatter[left + 1, a, b]
+                        factor[a, b] = noise[i, a, b] + inflation[i, a] * inflation[i, b] * (
+                            (1 - t) * scatter[left, a, b] + t * scatter[left + 1, a, b]
                         )
                 log_det = _factorize(factor, k)
                 chi, gain, information = _products(factor, residual, tangent, k)
@@ -118,6 +120,7 @@ def search_defocus(
 def linearize(
     noise: Array,
     local: Array,
+    inflation: Array,
     defocus: Array,
     interval: tuple[float, float],
     used: NDArray[np.int64],
@@ -129,7 +132,8 @@ def linearize(
 
     ``noise`` (n, f, f) of all features, of which ``used`` (k,) have told the defocus and the first two are
     the lateral motion; ``local`` (n, f, m): Chebyshev coefficients of each particle's curves over
-    ``interval``; ``nodes`` (g,) m, equidistant, with ``scatter`` (g, f, f), interpolated linearly.
+    ``interval``; ``nodes`` (g,) m, equidistant, with ``scatter`` (g, f, f), interpolated linearly, of which
+    ``inflation`` (n, f) multiplies the standard deviations.
     """
     count, f, terms = local.shape
     k = len(used)
@@ -161,10 +165,8 @@ def linearize(
         left = min(int(place), len(nodes) - 2)
         for a in range(f):
             for b in range(f):
-                total[a, b] = (
-                    noise[i, a, b]
-                    + (1 - (place - left)) * scatter[left, a, b]
-                    + (place - left) * scatter[left + 1, a, b]
+                total[a, b] = noise[i, a, b] + inflation[i, a] * inflation[i, b] * (
+                    (1 - (place - left)) * scatter[left, a, b] + (place - left) * scatter[left + 1, a, b]
                 )
         for a in range(k):
             for b in range(a + 1):
@@ -214,8 +216,10 @@ def _combine(coefficients: Array, basis: Array, curves: Array) -> None:
 
 
 @njit(forceinline=True, **_OPTIONS)
-def _levels(noise: Array, scatter: Array, residuals: Array, factors: Array, levels: Array) -> None:
-    """``levels = r' C^-1 r + ln det C`` for ``C = noise + scatter`` at every grid point.
+def _levels(
+    noise: Array, scatter: Array, inflation: Array, residuals: Array, factors: Array, levels: Array
+) -> None:
+    """``levels = r' C^-1 r + ln det C`` for ``C = noise + inflated scatter`` at every grid point.
 
     ``residuals`` (k, g), overwritten; ``scatter``, ``factors`` (k, k, g): lower Cholesky factors with their
     diagonals inverted, since products are faster than divisions.
@@ -225,12 +229,14 @@ def _levels(noise: Array, scatter: Array, residuals: Array, factors: Array, leve
     levels[:] = 0.0
     for a in range(k):
         diagonal = factors[a, a]
+        factor = inflation[a] * inflation[a]
         for g in range(points):
-            diagonal[g] = noise[a, a] + scatter[a, a, g]
+            diagonal[g] = noise[a, a] + factor * scatter[a, a, g]
         for b in range(a):
             entry = factors[a, b]
+            factor = inflation[a] * inflation[b]
             for g in range(points):
-                entry[g] = noise[a, b] + scatter[a, b, g]
+                entry[g] = noise[a, b] + factor * scatter[a, b, g]
             for c in range(b):
                 for g in range(points):
                     entry[g] -= factors[a, c, g] * factors[b, c, g]

@@ -31,6 +31,7 @@ from mems6dof_ros.calibration.model_fit import (
 from mems6dof_ros.calibration.optical_model import (
     FEATURES,
     FieldMap,
+    FocusSurface,
     features,
     field_position,
     fit_field_map,
@@ -189,9 +190,8 @@ def _fit_psf(
     model = fit.model
     x, y = (np.array([getattr(curve, axis) for curve in curves]) for axis in "xy")
 
-    def focus(stages: Array) -> tuple[FieldMap, float]:
-        surface = fit_focus(curves, stages, model.curves.radius, settings.rotations, fit.orders.focus)
-        return surface.surface, surface.variance
+    def focus(stages: Array) -> FocusSurface:
+        return fit_focus(curves, stages, model.curves.radius, settings.rotations, fit.orders.focus).surface
 
     return fit_psf(
         found,

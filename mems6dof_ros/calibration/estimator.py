@@ -51,11 +51,11 @@ class _Search(NamedTuple):
     measured: Array
     noise: Array
     local: Array
+    inflation: Array
     limits: NDArray[np.int64]
     defocus: Array
     objective: Array
     chi_square: Array
-    focus: Array
 
 
 class Estimator:
@@ -109,7 +109,7 @@ class Estimator:
         usable = np.flatnonzero(np.isfinite(fits.parameters).all(axis=1))
         if len(usable):
             search = self._search(fits[usable], None if moments is None else moments[usable])
-            z[usable] = search.defocus + search.focus[:, None]
+            z[usable] = search.defocus + self._model.focus(*search.measured[:, :2].T)[:, None]
             gap[usable] = search.objective[:, 1] - search.objective[:, 0]
         return z, gap
 
@@ -118,26 +118,29 @@ class Estimator:
         x, y = field_position(fits.parameters, self._pixel_size, self._image_size)
         measured, noise = features(fits, moments, self._pixel_size, model.reference(x, y))
         measured[:, 0], measured[:, 1] = x, y
-        local = model.curves.local(x, y)
+        local, inflation = model.curves.local(x, y), model.inflation(x, y)
         limits = self._limits(local)
         defocus, objective, chi_square = search_defocus(
             measured[:, used],
             noise[:, used[:, None], used[None, :]],
             local[:, used],
+            inflation[:, used],
             limits,
             self._grid,
             self._basis,
             self._slope_basis,
             self._scatter,
         )
-        return _Search(measured, noise, local, limits, defocus, objective, chi_square, model.focus(x, y))
+        return _Search(measured, noise, local, inflation, limits, defocus, objective, chi_square)
 
     def _locate(
         self, fits: GaussianFits, moments: Moments | None
     ) -> tuple[Array, Array, Array, NDArray[np.uint32]]:
-        measured, noise, local, limits, defocus, objective, chi_square, focus = self._search(fits, moments)
+        measured, noise, local, inflation, limits, defocus, objective, chi_square = self._search(
+            fits, moments
+        )
         best, second = defocus.T
-        position, covariance = self._corrected(measured, noise, local, best, focus)
+        position, covariance = self._corrected(measured, noise, local, inflation, best)
         z_gap = objective[:, 1] - objective[:, 0]
 
         sd_u = np.sqrt(covariance[:, 2, 2])
@@ -151,7 +154,7 @@ class Estimator:
         covariance[ambiguous] = self._mixture(
             position[ambiguous],
             covariance[ambiguous],
-            self._corrected(*(a[ambiguous] for a in (measured, noise, local, second, focus))),
+            self._corrected(*(a[ambiguous] for a in (measured, noise, local, inflation, second))),
             z_gap[ambiguous],
         )
         return position, covariance, z_gap, flags.astype(np.uint32)
@@ -174,15 +177,16 @@ class Estimator:
         )
 
     def _corrected(
-        self, measured: Array, noise: Array, local: Array, u: Array, focus: Array
+        self, measured: Array, noise: Array, local: Array, inflation: Array, u: Array
     ) -> tuple[Array, Array]:
         """Positions (n, 3) at defocus ``u`` with their covariance (n, 3, 3), linearised there."""
         model = self._model
         motion, covariance = linearize(
-            noise, local, u, model.curves.interval, self._used, model.nodes, model.scatter
+            noise, local, inflation, u, model.curves.interval, self._used, model.nodes, model.scatter
         )
-        covariance[:, 2, 2] += model.focus_variance
-        position = np.column_stack([measured[:, :2] - motion, u + focus])
+        place = measured[:, :2]
+        covariance[:, 2, 2] += model.focus.variance(*place.T)
+        position = np.column_stack([place - motion, u + model.focus(*place.T)])
         return position, covariance
 
     def _mixture(self, position: Array, covariance: Array, other: tuple[Array, Array], gap: Array) -> Array:

@@ -21,13 +21,20 @@ import yaml
 from numpy.typing import NDArray
 
 from mems6dof_ros.calibration import psf_model
+from mems6dof_ros.calibration.bead_field import BeadField
 from mems6dof_ros.calibration.estimator import ALL_FEATURES, METHODS, SHAPE, Estimator
 from mems6dof_ros.calibration.field_correction import FieldCorrection
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
 from mems6dof_ros.calibration.field_modes import FieldModes
 from mems6dof_ros.calibration.interface import Positions
 from mems6dof_ros.calibration.moments import residual_moments
-from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel, field_position
+from mems6dof_ros.calibration.optical_model import (
+    FEATURES,
+    FieldMap,
+    FocusSurface,
+    OpticalModel,
+    field_position,
+)
 from mems6dof_ros.calibration.psf_estimator import PsfEstimator
 from mems6dof_ros.calibration.psf_model import PsfModel
 from mems6dof_ros.documents import read_document, write_whole
@@ -258,6 +265,8 @@ def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
     model, camera, valid = calibration.model, calibration.camera, calibration.valid
     light = model.illumination
     illumination = {} if light is None else {"ln_illumination": light.coefficients.tolist()}
+    beads = model.focus.beads.places
+    places = {"bead_places_m": beads.tolist()} if len(beads) else {}
     psf = {} if calibration.psf is None else {"psf": psf_model.content(calibration.psf)}
     return {
         "optics": {
@@ -283,7 +292,8 @@ def _content_of_optics(calibration: Calibration) -> dict[str, Any]:
             "features": list(FEATURES),
             "coefficients": model.curves.coefficients.tolist(),
             "focus_surface_m": model.focus.coefficients.tolist(),
-            "focus_variance_m2": float(model.focus_variance),
+            "focus_variance_m2": float(model.focus.mean_variance),
+            **places,
             "ln_reference_amplitude_per_flux": model.reference.coefficients.tolist(),
             "scatter_defocus_m": model.nodes.tolist(),
             "scatter_covariance": model.scatter.tolist(),
@@ -351,16 +361,19 @@ def _read_version_1(fields: _Fields) -> Calibration:
     nodes = model.array("scatter_defocus_m", -1)
     width, height = optics.array("image_size_px", 2)
     count = len(FEATURES)
+    places = model.array("bead_places_m", -1, 2) if "bead_places_m" in model else np.empty((0, 2))
+    beads = BeadField(radius, places)
     return Calibration(
         OpticalModel(
             FieldCurves(
                 radius, model.interval("defocus_interval_m"), model.array("coefficients", count, -1, -1)
             ),
-            FieldMap(radius, model.array("focus_surface_m", -1)),
+            FocusSurface(
+                radius, model.array("focus_surface_m", -1), model.number("focus_variance_m2"), beads
+            ),
             FieldMap(radius, model.array("ln_reference_amplitude_per_flux", -1)),
             nodes,
             model.array("scatter_covariance", len(nodes), count, count),
-            model.number("focus_variance_m2"),
             FieldMap(radius, model.array("ln_illumination", -1)) if "ln_illumination" in model else None,
         ),
         pixel_size=optics.number("pixel_size_m"),
@@ -381,7 +394,7 @@ def _read_version_1(fields: _Fields) -> Calibration:
         ),
         method=fields("method"),
         provenance=fields("provenance"),
-        psf=psf_model.read(fields.section("psf")) if "psf" in fields else None,
+        psf=psf_model.read(fields.section("psf"), beads) if "psf" in fields else None,
     )
 
 

@@ -12,14 +12,15 @@ them, are fitted together; in a single stack the tilt belongs to f.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mems6dof_ros.calibration.bead_field import BeadField
 from mems6dof_ros.calibration.field_curves import Array, BeadSamples, FieldCurves, FieldRegression
-from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, OpticalModel
+from mems6dof_ros.calibration.optical_model import FEATURES, FieldMap, FocusSurface, OpticalModel
 from mems6dof_ros.calibration.zernike import zernike, zernike_count
 
 #: Groups of features that may need different orders, as slices of FEATURES.
@@ -79,14 +80,13 @@ class CrossValidation:
 
 
 class FocusFit(NamedTuple):
-    """``scores``: rms left-one-out residual m by order; the ``order`` taken; the focus ``surface``, its
-    ``variance`` m^2, and the beads' ``own_height`` (b,) m about it."""
+    """``scores``: rms left-one-out residual m by order; the ``order`` taken; the focus ``surface``, and the
+    beads' ``own_height`` (b,) m about it."""
 
     scores: dict[int, float]
     order: int
-    surface: FieldMap
+    surface: FocusSurface
     own_height: Array
-    variance: float
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def fit_model(
             current = _best(validation)
         curves = _fit(regression, current)
         residual = _held_out(regression, alignment, current)
-        scatter = _scatter(alignment, residual, nodes)
+        scatter = _scatter(alignment, residual, alignment.inflation(current), nodes)
         if number < _ROUNDS:
             if number > 0 and len(beads) > 1:
                 alignment.drop_outliers(residual)
@@ -149,7 +149,7 @@ def fit_model(
         beads, alignment.sharpest, reference.radius, rotations, None if orders is None else orders.focus
     )
     return ModelFit(
-        OpticalModel(curves, focus.surface, reference, nodes, scatter, focus.variance),
+        OpticalModel(curves, focus.surface, reference, nodes, scatter),
         Orders(current.field, current.degree, focus.order),
         CrossValidation(validation.curves, focus.scores),
         alignment.sharpest,
@@ -170,6 +170,12 @@ def sharpest_stage(bead: BeadCurve) -> float:
     a, b, _ = np.polyfit((bead.stage_z[near] - centre) / reach, size[near], 2)
     vertex = -b / (2 * a) if a > 0 else 0.0
     return float(centre + reach * np.clip(vertex, -1, 1))
+
+
+def bead_field(beads: Sequence[BeadCurve], radius: float) -> BeadField:
+    """Where ``beads`` are, on a disc of ``radius`` m; unknown for a single one: nothing scatters there."""
+    places = np.array([(bead.x, bead.y) for bead in beads]) if len(beads) > 1 else np.empty((0, 2))
+    return BeadField(radius, places)
 
 
 def merge_curves(parts: dict[str, FieldCurves]) -> FieldCurves:
@@ -250,6 +256,18 @@ class _Alignment:
             BeadSamples(only.x, only.y, only.argument[k], only.values[k], only.weights[k])
             for k in (slice(n, n + 1) for n in range(len(only.argument)))
         ]
+
+    def inflation(self, orders: Orders) -> Array:
+        """Factor (b, k) by which curves fitted without a bead make the standard deviation of its residuals
+        larger than that of beads about the truth; one for the only bead, whose planes are left out."""
+        field = bead_field(self._beads, self._radius)
+        x, y = field.places.T
+        by_feature = tuple(orders.field[name] for name, group in GROUPS.items() for _ in FEATURES[group])
+        found = np.ones((len(self._beads), len(FEATURES)))
+        for left_out in _folds(len(self._beads)) if len(self._beads) > 1 else ():
+            others = replace(field, places=field.places[~left_out])
+            found[left_out] = others.inflation(by_feature, x[left_out], y[left_out])
+        return found
 
     def regression(self, highest: tuple[int, int]) -> FieldRegression:
         return FieldRegression(self.pieces(), self._radius, self._interval, *highest)
@@ -369,11 +387,15 @@ def _best(validation: CrossValidation) -> Orders:
     )
 
 
-def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Array:
-    """Covariance (g, k, k) of the beads about the curves near each node, fit noise taken off."""
+def _scatter(alignment: _Alignment, residual: list[Array], inflation: Array, nodes: Array) -> Array:
+    """Covariance (g, k, k) of the beads about the true curves near each node, fit noise taken off, from their
+    held-out ``residual``, whose standard deviations are larger by ``inflation`` (b, k)."""
     u = np.concatenate([sample.argument for sample in alignment.samples()])
     r = np.concatenate(residual)
     noise = np.concatenate(alignment.noise())
+    larger = np.repeat(inflation, [len(one) for one in residual], axis=0)
+    excess = (r[:, :, None] * r[:, None, :] - noise) / (larger[:, :, None] * larger[:, None, :])
+    r = r / larger
     # Few beads cannot tell how the scatter varies with defocus, nor how features scatter together.
     beads = len(residual)
     width = (nodes[1] - nodes[0]) * max(1.5, 1.5 * np.sqrt(_MANY_BEADS / beads))
@@ -381,7 +403,6 @@ def _scatter(alignment: _Alignment, residual: list[Array], nodes: Array) -> Arra
     found = np.empty((len(nodes), len(FEATURES), len(FEATURES)))
     for index, node in enumerate(nodes):
         weight = np.clip(1 - np.abs(u - node) / width, 0, None)
-        excess = r[:, :, None] * r[:, None, :] - noise
         weight_sum = max(weight.sum(), 1e-12)
         mean = np.einsum("n,nkl->kl", weight, excess) / weight_sum
         modes = _MODES @ mean @ _MODES.T
@@ -454,8 +475,8 @@ def _focus_scores(
 
 def _focus_surface(
     beads: Sequence[BeadCurve], sharpest: Array, radius: float, order: int, rotations: Sequence[float] | None
-) -> tuple[FieldMap, Array, float]:
-    """Focus surface, the beads' own heights (b,) m about it, variance of the surface (m^2)."""
+) -> tuple[FocusSurface, Array]:
+    """Focus surface and the beads' own heights (b,) m about it."""
     design, before = _focus_design(beads, radius, order, rotations)
     inverse = np.linalg.pinv(design)
     solution = inverse @ sharpest
@@ -465,4 +486,4 @@ def _focus_surface(
     variance = float(np.sum(own_height**2)) / freedom * design.shape[1] / len(beads) if freedom > 0 else 0.0
     surface = np.concatenate([[0.0], solution[before:]])
     surface[0] = -(zernike(order, np.zeros(1), np.zeros(1))[0] @ surface)
-    return FieldMap(radius, surface), own_height, variance
+    return FocusSurface(radius, surface, variance, bead_field(beads, radius)), own_height

@@ -15,10 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
 
+from mems6dof_ros.calibration.bead_field import BeadField, used_order
 from mems6dof_ros.calibration.field_curves import Array, FieldCurves
 from mems6dof_ros.calibration.moments import MOMENTS, Moments
 from mems6dof_ros.calibration.zernike import zernike, zernike_order
@@ -41,6 +43,27 @@ class FieldMap:
         """Value at field positions ``x``, ``y`` (n,) m: (n,)."""
         order = zernike_order(len(self.coefficients))
         return zernike(order, x / self.radius, y / self.radius) @ self.coefficients
+
+
+@dataclass(frozen=True)
+class FocusSurface(FieldMap):
+    """Where ``beads``, at unknown heights of their own, show the optics to be in focus, m.
+    ``mean_variance`` m^2: of the surface, mean over the beads."""
+
+    mean_variance: float
+    beads: BeadField
+
+    def scaled_influence(self, x: Array, y: Array) -> Array:
+        """Rows (n, terms) m at ``x``, ``y`` (n,) m whose products are the covariance of the surface."""
+        terms = len(self.coefficients)
+        if not len(self.beads.places):
+            return np.full((len(x), 1), np.sqrt(self.mean_variance))
+        one_bead = self.mean_variance * len(self.beads.places) / terms
+        return np.sqrt(one_bead) * self.beads.influence(zernike_order(terms), x, y)
+
+    def variance(self, x: Array, y: Array) -> Array:
+        """Variance (n,) m^2 of the surface at ``x``, ``y`` (n,) m."""
+        return np.asarray(np.sum(self.scaled_influence(x, y) ** 2, axis=1))
 
 
 def fit_field_map(
@@ -69,18 +92,26 @@ class OpticalModel:
     natural logarithm of the amplitude at rho* over the flux (px^-2), for rho_amp.
 
     ``nodes`` (g,) m: defocus at which ``scatter`` (g, k, k) gives the covariance of the particles'
-    features about the model, fit noise excluded. ``focus_variance`` m^2: of the focus surface.
+    features about the true curves, fit noise excluded; ``inflation`` is what the fitted curves add.
     ``illumination``: natural logarithm of the brightness over the field relative to the axis; None in
     files written before it was measured.
     """
 
     curves: FieldCurves
-    focus: FieldMap
+    focus: FocusSurface
     reference: FieldMap
     nodes: Array
     scatter: Array
-    focus_variance: float
     illumination: FieldMap | None = None
+
+    @cached_property
+    def _orders(self) -> tuple[int, ...]:
+        return tuple(used_order(coefficients) for coefficients in self.curves.coefficients)
+
+    def inflation(self, x: Array, y: Array) -> Array:
+        """Standard deviations (n, k) of particles' features about the model at ``x``, ``y`` (n,) m, over
+        those of ``scatter``: the curves are known from beads that scatter, less well where these are far."""
+        return self.focus.beads.inflation(self._orders, x, y)
 
     def brightness(self, fits: GaussianFits, x: Array, y: Array) -> Array:
         """Electrons (n,) that the particles of ``fits`` at ``x``, ``y`` (n,) m would show on the axis."""

@@ -85,11 +85,16 @@ class _Joint(NamedTuple):
 @dataclass(frozen=True)
 class Components:
     """``images`` (k, side, side) and ``curves`` of their amplitudes: outputs are, for the image and then for
-    each mode, the k components."""
+    each mode, the k components. ``shares`` (m, terms + 1): of the pupil's coefficients and ln diameter in
+    what each mode changes."""
 
     images: Array
     curves: FieldCurves
-    modes: int
+    shares: Array
+
+    @property
+    def modes(self) -> int:
+        return len(self.shares)
 
 
 class PsfEstimator:
@@ -163,6 +168,9 @@ class PsfEstimator:
         curves = components.curves.local(*place.T).reshape(
             len(z), 1 + components.modes, len(components.images), -1
         )
+        # A mode of unit prior is as large as particles differ from the fitted field there.
+        larger = np.sqrt(model.inflation(*place.T) ** 2 @ components.shares.T)
+        curves[:, 1:] *= larger[:, :, None, None]
         parameters = np.empty((len(z), 5 + components.modes))
         return _Start(starts, slope / pixel, np.ascontiguousarray(curves), focus, parameters)
 
@@ -182,7 +190,7 @@ class PsfEstimator:
         )
         scale = np.array([pixel, pixel, 1.0])
         covariance = covariance * scale[:, None] * scale
-        covariance[:, 2, 2] += self._model.focus_variance
+        covariance[:, 2, 2] += self._model.focus.variance(*position[:, :2].T)
         return position, covariance
 
     # ------------------------------------------------------------------------ neighbours
@@ -330,7 +338,7 @@ def compress(
     heights = -np.cos(np.pi * (np.arange(_DEGREE + 3) + 0.5) / (_DEGREE + 3))
     u = 0.5 * (high + low) + 0.5 * (high - low) * heights
     wavefront, _ = model.at(x, y)
-    modes = _modes(model, pupil, scale)
+    modes, shares = _modes(model, pupil, scale)
     middle, reach = pupil.side_px // 2, window_px // 2 + MARGIN
     cut = np.s_[:, middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
     size = 2 * reach + 1
@@ -359,11 +367,12 @@ def compress(
     coefficients = np.einsum("jf,du,mfuk->mkjd", over_field, over_defocus, amplitudes, optimize=True)
     coefficients = coefficients.reshape(-1, zernike_count(order), _DEGREE + 1)
     curves = FieldCurves(model.radius, model.interval, coefficients)
-    return Components(np.ascontiguousarray(images), curves, len(modes))
+    return Components(np.ascontiguousarray(images), curves, shares)
 
 
-def _modes(model: PsfModel, pupil: PupilImages, scale: float) -> Array:
-    """Own departures (m, terms + 1) of unit variance that matter for images of 1e5 electrons."""
+def _modes(model: PsfModel, pupil: PupilImages, scale: float) -> tuple[Array, Array]:
+    """Own departures (m, terms + 1) of unit variance that matter for images of 1e5 electrons, and the shares
+    of their coefficients in it."""
     low, high = model.interval
     u = np.linspace(max(low, -2e-6), min(high, 2e-6), 5)
     wavefront = np.tile(model.at(np.zeros(1), np.zeros(1))[0], (len(u), 1))
@@ -377,4 +386,6 @@ def _modes(model: PsfModel, pupil: PupilImages, scale: float) -> Array:
     seen, directions = np.linalg.eigh(root.T @ information @ root)
     chosen = np.argsort(seen)[::-1][:MOST_MODES]
     chosen = chosen[seen[chosen] > LEAST_MODE]
-    return np.asarray((root @ directions[:, chosen]).T)
+    modes = (root @ directions[:, chosen]).T
+    shares = modes**2 * np.diag(information)
+    return modes, shares / shares.sum(axis=1, keepdims=True)

@@ -7,13 +7,15 @@ starting values. Heights count as in the forward model of the Gaussians, so that
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
+from mems6dof_ros.calibration.bead_field import BeadField, used_order
 from mems6dof_ros.calibration.field_curves import Array
-from mems6dof_ros.calibration.optical_model import FieldMap, fit_field_map
+from mems6dof_ros.calibration.optical_model import FocusSurface, fit_field_map
 from mems6dof_ros.calibration.psf_fit import (
     COUNT,
     DIAMETER,
@@ -45,9 +47,9 @@ class PsfModel:
     ``wavefront`` (terms, Zernike terms of the field) waves rms, in the order of PUPIL_TERMS; ``slope``
     (2, Zernike terms) rad of the chief ray; both on a disc of ``radius`` m, filled up with zeros where a
     term needs a lower order. ``ln_diameter``: of the mean diameter over the nominal one. ``focus``: z of
-    zero defocus, ``focus_variance`` m^2. ``scatter`` (terms + 1, terms + 1): covariance of single particles'
-    coefficients and ln diameter. ``interval`` m: defocus that the beads covered. ``misfit``: relative
-    error of the model where the beads' light is, beyond noise.
+    zero defocus. ``scatter`` (terms + 1, terms + 1): covariance of single particles' coefficients and ln
+    diameter about their true means; ``inflation`` is what fitted means add. ``interval`` m: defocus that
+    the beads covered. ``misfit``: relative error of the model where the beads' light is, beyond noise.
     """
 
     imaging: Imaging
@@ -55,8 +57,7 @@ class PsfModel:
     wavefront: Array
     slope: Array
     ln_diameter: float
-    focus: FieldMap
-    focus_variance: float
+    focus: FocusSurface
     scatter: Array
     interval: tuple[float, float]
     misfit: float
@@ -67,6 +68,16 @@ class PsfModel:
         that pixels within lambda / 4 NA of each other are wrong together."""
         cell = self.imaging.wavelength / (4 * self.imaging.numerical_aperture)
         return self.misfit * max(1.0, cell / self.imaging.pixel_size)
+
+    @cached_property
+    def _orders(self) -> tuple[int, ...]:
+        return *(used_order(coefficients) for coefficients in self.wavefront), 0
+
+    def inflation(self, x: Array, y: Array) -> Array:
+        """Standard deviations (n, terms + 1) of particles' coefficients and ln diameter about the model at
+        ``x``, ``y`` (n,) m, over those of ``scatter``: the field is known from beads that scatter, and less
+        well where these are far."""
+        return self.focus.beads.inflation(self._orders, x, y)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Wavefronts (n, terms) waves and chief-ray slopes (n, 2) rad at field positions (n,) m."""
@@ -87,8 +98,8 @@ class PsfBead:
     place_px: tuple[float, float]
 
 
-#: Fits stage positions (b,) m of focus over the field: the surface and its variance, m^2.
-FitFocus = Callable[[Array], tuple[FieldMap, float]]
+#: Fits stage positions (b,) m of focus over the field.
+FitFocus = Callable[[Array], FocusSurface]
 
 
 def fit_psf(
@@ -146,20 +157,22 @@ def _model(
     field = np.array([np.pad(m.coefficients, (0, terms - len(m.coefficients))) for m, _ in fitted])
     slopes = SLOPE.stop - SLOPE.start
     mean_diameter = float(np.mean(values[:, DIAMETER]))
-    # Own departures, as large as they would be had the bead not taken part, and as uncertain as the
-    # field there.
+    stages = values[:, STAGE] * 1e-6
+    surface = focus(stages)
+    # Own departures from what the others say, which is as uncertain as the leverage 1 / (1 - h) - 1 says.
     own = np.column_stack(
         [left_out for _, left_out in fitted[slopes:]]
         + [(values[:, DIAMETER] - mean_diameter) * beads / max(beads - 1, 1)]
     )
+    orders = [zernike_order(len(m.coefficients)) for m, _ in fitted[slopes:]] + [0]
+    leverage = np.column_stack([surface.beads.leverage(order, x, y) for order in orders])
+    own *= np.sqrt(np.maximum(1 - leverage, 0))
     scatter = own.T @ own / beads - noise[WAVEFRONT.start :, WAVEFRONT.start :]
     apart = max(0.0, 1 - beads / _MANY_BEADS)
     scatter = (1 - apart) * scatter + apart * np.diag(np.diag(scatter))
     # A variance known from few beads: what is measured next follows Student's distribution.
     count = max(beads, _LEAST_BEADS)
     scatter *= count / (count - 2)
-    stages = values[:, STAGE] * 1e-6
-    surface, variance = focus(stages)
     piston = float(np.mean(heights - stages - surface(x, y)))
     coefficients = surface.coefficients.copy()
     coefficients[0] += piston
@@ -169,8 +182,7 @@ def _model(
         field[slopes:],
         field[:slopes] * imaging.pixel_size * 1e6,
         mean_diameter,
-        FieldMap(radius, coefficients),
-        variance,
+        replace(surface, coefficients=coefficients),
         _positive(scatter),
         (interval[0] - piston, interval[1] - piston),
         float(np.sqrt(max(float(np.mean([r.misfit for r in found])), 0.0))),
@@ -206,15 +218,15 @@ def content(model: PsfModel) -> dict[str, Any]:
         "chief_ray_slope_rad": model.slope.tolist(),
         "ln_diameter_over_nominal": float(model.ln_diameter),
         "focus_surface_m": model.focus.coefficients.tolist(),
-        "focus_variance_m2": float(model.focus_variance),
+        "focus_variance_m2": float(model.focus.mean_variance),
         "scatter_covariance": model.scatter.tolist(),
         "defocus_interval_m": [float(v) for v in model.interval],
         "misfit": float(model.misfit),
     }
 
 
-def read(fields: Fields) -> PsfModel:
-    """The model that ``content`` described; InputError for what it could not have been."""
+def read(fields: Fields, beads: BeadField) -> PsfModel:
+    """The model, fitted to ``beads``, that ``content`` described; InputError for what it could not be."""
     terms = len(PUPIL_TERMS)
     radius = fields.number("disc_radius_m")
     wavefront = fields.array("wavefront_waves", terms, -1)
@@ -229,8 +241,7 @@ def read(fields: Fields) -> PsfModel:
         wavefront,
         fields.array("chief_ray_slope_rad", 2, wavefront.shape[1]),
         fields.number("ln_diameter_over_nominal"),
-        FieldMap(radius, fields.array("focus_surface_m", -1)),
-        fields.number("focus_variance_m2"),
+        FocusSurface(radius, fields.array("focus_surface_m", -1), fields.number("focus_variance_m2"), beads),
         fields.array("scatter_covariance", terms + 1, terms + 1),
         fields.interval("defocus_interval_m"),
         fields.number("misfit"),

@@ -15,6 +15,7 @@ from mems6dof_ros.calibration.field_curves import Array
 from mems6dof_ros.calibration.file import Calibration
 from mems6dof_ros.calibration.focus_stack import BeadStack, FocusStack, measure_stack
 from mems6dof_ros.calibration.model_fit import GROUPS, Orders
+from mems6dof_ros.calibration.stage_scale import BeadScan, stage_scale
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
@@ -58,6 +59,9 @@ def astigmatic_stack(planes: Sequence[Frame], window_px: int = 25) -> FocusStack
     return measure_stack(planes, camera, DEFAULT_WEIGHTING, window_px, "astigmatic, real")
 
 
+#: Planes beyond those judged from which the scale of the stage is learnt as well, m.
+_MARGIN = 200e-9
+
 #: Of the astigmatic stack: aperture and wavelength as published, diameter as it appears (fitted, once).
 ASTIGMATIC = CalibrationSettings(numerical_aperture=0.85, wavelength=520e-9, bead_diameter=350e-9)
 
@@ -69,13 +73,23 @@ def intrinsic_stack(folder: Path, window_px: int = 31) -> FocusStack:
     return measure_stack(frames(source), camera, DEFAULT_WEIGHTING, window_px, "intrinsic, real")
 
 
+class LeftOut(NamedTuple):
+    """z of beads that were left out, against the stage ``as_stated``, ``as_others_see`` it in the same image,
+    and against the stage as stated ``on_its_scale``, which the others show (errors alone, m)."""
+
+    as_stated: StageErrors
+    as_others_see: StageErrors
+    on_its_scale: Array
+
+
 class _Scan(NamedTuple):
-    """z against the stage as stated of every bead in every plane (b, p) m, NaN beyond reach; the claimed
-    ``variance`` m^2; which have no flag."""
+    """z against the stage as stated of every bead in every plane (b, p) m, NaN where not measured; the
+    claimed ``variance`` m^2; which have no flag; which are within reach of the bead's focus."""
 
     z: Array
     variance: Array
     good: NDArray[np.bool_]
+    near: NDArray[np.bool_]
 
 
 def one_bead_left_out(
@@ -85,27 +99,46 @@ def one_bead_left_out(
     settings: CalibrationSettings,
     methods: Sequence[str],
     beads: Sequence[int] | None = None,
-) -> dict[str, tuple[StageErrors, StageErrors]]:
+) -> dict[str, LeftOut]:
     """Calibrate from all beads but one, measure that one within ``reach`` m of its focus, for every bead or
     those of the numbers in ``beads``.
 
-    Per method the errors against the stage as stated, and against the stage as the other beads in the same
-    image show it: the mean of theirs. The bead's own height is taken off.
+    Per method the errors against the stage as stated, against the stage as the other beads in the same image
+    show it, the mean of theirs, and against the stage as stated on the smooth ``stage_scale`` that the other
+    beads show. The bead's own height is taken off.
     """
     found: dict[str, list[tuple[Array, ...]]] = {name: [] for name in methods}
+    scaled: dict[str, list[Array]] = {name: [] for name in methods}
+    stage_z = np.array([frame.stage_z for frame in planes])
     for index in range(len(stack.beads)) if beads is None else beads:
         others = replace(stack, beads=stack.beads[:index] + stack.beads[index + 1 :])
         calibration = calibrate([others], settings).calibration
         for name in methods:
-            scan = _through_focus(calibration.with_method(name), stack, planes, reach)
+            scan = _through_focus(calibration.with_method(name), stack, planes, reach, _MARGIN)
             found[name].append(_against_others(scan, index))
+            scans = _bead_scans(scan, stage_z)
+            scale = stage_scale([*scans[:index], *scans[index + 1 :]], float(stage_z[1] - stage_z[0]))
+            scaled[name].append(scale.remaining(scans[index]))
     results = {}
     for name, parts in found.items():
         *columns, good = (np.concatenate(column) for column in zip(*parts, strict=True))
         use, flagged = good.astype(bool), 1 - float(np.mean(good))
         stated, stated_sd, apart, apart_sd = (column[use] for column in columns)
-        results[name] = StageErrors(stated, stated_sd, flagged), StageErrors(apart, apart_sd, flagged)
+        results[name] = LeftOut(
+            StageErrors(stated, stated_sd, flagged),
+            StageErrors(apart, apart_sd, flagged),
+            np.concatenate(scaled[name]),
+        )
     return results
+
+
+def _bead_scans(scan: _Scan, stage_z: Array) -> list[BeadScan]:
+    """What ``stage_scale`` wants to know of every bead of ``scan``."""
+    found = []
+    for z, variance, good, near in zip(*scan, strict=True):
+        error, stated = z[good], stage_z[good]
+        found.append(BeadScan(stated - error, error, variance[good], near[good]))
+    return found
 
 
 def stage_departures(
@@ -131,8 +164,8 @@ def _against_others(scan: _Scan, index: int) -> tuple[Array, ...]:
     """Of the bead ``index``: error and sd against the stage as stated, error and sd against the other beads,
     and which have no flag. The others' own uncertainty is in the latter sd."""
     others = np.arange(len(scan.z)) != index
-    weight = np.where(scan.good, 1 / scan.variance, 0.0)[others]
-    seen = np.isfinite(scan.z[index]) & (weight.sum(axis=0) > 0)
+    weight = np.where(scan.good & scan.near, 1 / scan.variance, 0.0)[others]
+    seen = scan.near[index] & (weight.sum(axis=0) > 0)
     weight, z, good = weight[:, seen], scan.z[index, seen], scan.good[index, seen]
     stage_variance = 1 / weight.sum(axis=0)
     stage = np.sum(weight * np.nan_to_num(scan.z[others][:, seen]), axis=0) * stage_variance
@@ -147,18 +180,19 @@ def _against_others(scan: _Scan, index: int) -> tuple[Array, ...]:
 
 
 def _through_focus(
-    calibration: Calibration, stack: FocusStack, planes: Sequence[Frame], reach: float
+    calibration: Calibration, stack: FocusStack, planes: Sequence[Frame], reach: float, margin: float = 0.0
 ) -> _Scan:
-    """All beads of ``stack`` within ``reach`` of their foci; z about the mean of each."""
+    """All beads of ``stack`` within ``reach`` and ``margin`` of their foci; z about the mean in reach."""
     shape = len(stack.beads), len(planes)
     psf = calibration.psf if calibration.method == "psf" else None
-    surface = (psf or calibration.model).focus_variance
-    z, variance, good = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+    focus = (psf or calibration.model).focus
+    z, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+    good, near = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for plane, frame in enumerate(planes):
         at = [
             (number, int(np.argmin(np.abs(bead.stage_z - frame.stage_z))))
             for number, bead in enumerate(stack.beads)
-            if abs(frame.stage_z - bead.stage_z[bead.in_focus]) <= reach
+            if abs(frame.stage_z - bead.stage_z[bead.in_focus]) <= reach + margin
             and np.abs(bead.stage_z - frame.stage_z).min() < 1e-9
         ]
         if not at:
@@ -173,10 +207,14 @@ def _through_focus(
         found = calibration.locate(fits, frame.image)
         z[beads, plane] = found.position[: len(at), 2] + frame.stage_z
         # Own heights are taken off, and with them what the focus surface is uncertain by.
+        surface = focus.variance(*found.position[: len(at), :2].T)
         variance[beads, plane] = found.covariance[: len(at), 2, 2] - surface
         good[beads, plane] = found.flags[: len(at)] == 0
-    count = np.maximum(good.sum(axis=1, keepdims=True), 1)
-    return _Scan(z - np.sum(np.where(good, z, 0.0), axis=1, keepdims=True) / count, variance, good)
+        focus_z = np.array([stack.beads[b].stage_z[stack.beads[b].in_focus] for b in beads])
+        near[beads, plane] = np.abs(frame.stage_z - focus_z) <= reach
+    judged = good & near
+    height = np.sum(np.where(judged, z, 0.0), axis=1) / np.maximum(judged.sum(axis=1), 1)
+    return _Scan(z - height[:, None], variance, good, near)
 
 
 def one_plane_left_out(stack: FocusStack, reach: float, orders: Orders) -> StageErrors:

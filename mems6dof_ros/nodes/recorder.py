@@ -14,6 +14,7 @@ import functools
 import importlib
 import shutil
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -125,6 +126,7 @@ class RecorderNode(InstrumentNode):
     def __init__(self) -> None:
         super().__init__("recorder", PARAMETERS)
         self._bag: BagWriter | None = None
+        self._handing_over = threading.Lock()  # held to put messages, and to put what ends their bag
         self._failed: BagWriter | None = None
         self._bags = 0
         self._closing: Future | None = None  # of the last bag
@@ -161,7 +163,7 @@ class RecorderNode(InstrumentNode):
 
     def deactivate(self) -> None:
         assert self.worker is not None
-        self._stream.ask_to_end()
+        self._stream.end()
         self.worker.end(timeout=None)  # a slow disk is no reason to lose a record; a second signal is
         super().deactivate()
         bag, self._bag = self._bag, None
@@ -226,18 +228,20 @@ class RecorderNode(InstrumentNode):
 
     def _on_message(self, channel: Channel, data: bytes, info: dict[str, Any]) -> None:
         assert self.worker is not None
-        if self._bag is None:
-            return
-        received = _Received(
-            channel,
-            data,
-            time.time_ns(),
-            info["source_timestamp"],
-            info.get("publication_sequence_number") or 0,
-        )
-        self.health.count("messages")
-        self._account(received)
-        self.worker.put(functools.partial(self._write, self._bag, received), len(data))
+        with self._handing_over:
+            bag = self._bag
+            if bag is None:
+                return
+            received = _Received(
+                channel,
+                data,
+                time.time_ns(),
+                info["source_timestamp"],
+                info.get("publication_sequence_number") or 0,
+            )
+            self.health.count("messages")
+            self._account(received)
+            self.worker.put(functools.partial(self._write, bag, received), len(data))
 
     def _account(self, received: _Received) -> None:
         """Count what the wire lost; with several publishers on a topic the numbers do not tell."""
@@ -265,11 +269,13 @@ class RecorderNode(InstrumentNode):
         return received.channel.type == self._cycle_types[-1]
 
     def _flush(self, bag: BagWriter) -> None:
-        if bag is not self._failed:
-            with self._failing(bag):
-                bag.flush()
-                self._flushed = time.monotonic()
-                self._do_between(bag)
+        if bag is self._failed:
+            self._leave_undone()
+            return
+        with self._failing(bag):
+            bag.flush()
+            self._flushed = time.monotonic()
+            self._do_between(bag)
 
     def _close(self, bag: BagWriter) -> None:
         if bag is not self._failed:
@@ -295,8 +301,11 @@ class RecorderNode(InstrumentNode):
             self._bag, self._failed = None, bag
             self.health.failure = f"recording stopped: {bag.path}: {error.strerror or error}"
             self.health.refused(self.health.failure)
-            while self._between:
-                self._between.popleft()[1].set_result(None)
+            self._leave_undone()
+
+    def _leave_undone(self) -> None:
+        while self._between:
+            self._between.popleft()[1].set_result(None)
 
     # Begin and end ------------------------------------------------------------------------------
 
@@ -361,11 +370,13 @@ class RecorderNode(InstrumentNode):
         self._sequences.clear()
         self._reader.forget()
         self._cycle_types = _CYCLE_TYPES
+        self.health.failure = ""
         self._bag = bag
 
     def _on_start(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._bag or (self._closing and not self._closing.done()):
-            path = self._bag.path if self._bag else "the last bag"
+        bag = self._bag
+        if bag or (self._closing and not self._closing.done()):
+            path = bag.path if bag else "the last bag"
             response.success, response.message = False, f"already recording to {path}"
             return response
         try:
@@ -375,39 +386,42 @@ class RecorderNode(InstrumentNode):
         except Mems6dofError as error:
             response.success, response.message = False, str(error)
             return response
-        assert self._bag is not None
-        self.health.failure = ""
-        self.tell("recording")
-        response.success, response.message = True, str(self._bag.path)
+        if bag := self._bag:
+            self.tell("recording")
+        response.success, response.message = bag is not None, str(bag.path) if bag else self.health.failure
         return response
 
     async def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._bag is None:
+        if (bag := self._bag) is None:
             response.success, response.message = False, self.health.failure or "not recording"
             return response
-        path = self._bag.path
+        path = bag.path
         await self._quiet()  # what was sent before this call may still be on its way through our callbacks
-        bag, self._bag = self._bag, None
-        if bag and self.worker is not None:  # not failed or deactivated meanwhile
-            self._closing = closing = Future()
+        closing = Future()
 
-            def close() -> None:
-                self._close(bag)
-                closing.set_result(None)
+        def close(bag: BagWriter) -> None:
+            self._close(bag)
+            closing.set_result(None)
 
-            self.worker.put(close, 0)  # behind what is queued, of which no more comes
+        with self._handing_over:  # behind what is queued, of which no more comes
+            bag, self._bag = self._bag, None
+            if bag and self.worker is not None:  # not failed or deactivated meanwhile
+                self._closing = closing
+                self.worker.put(functools.partial(close, bag), 0)
+        if self._closing is closing:
             await closing
         response.success, response.message = not self.health.failure, self.health.failure or str(path)
         self.tell("stopped")
         return response
 
     async def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._bag is None or self.worker is None:
+        bag = self._bag
+        if bag is None or self.worker is None:
             response.success, response.message = False, self.health.failure or "not recording"
             return response
         completed = Future()
         self._between.append((BagWriter.split, completed))
-        self.worker.put(functools.partial(self._flush, self._bag), 0)
+        self.worker.put(functools.partial(self._flush, bag), 0)
         path = await completed
         response.success, response.message = path is not None, str(path or self.health.failure)
         return response

@@ -5,20 +5,26 @@ from __future__ import annotations
 import itertools
 import re
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from peers import NodeProcess, Peer
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from mems6dof_msgs.msg import Pose6DOF
 from mems6dof_ros.analysis.check import check_bag
+from mems6dof_ros.nodes import transport
+from mems6dof_ros.nodes.recorder import RecorderNode
 from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.recording.validation import disk
 from mems6dof_ros.recording.validation.crash import die
@@ -140,6 +146,54 @@ def test_a_full_disk_ends_the_record_and_says_so(start: Start, peer: Peer, small
     assert peer.call(Trigger, "recorder/stop").success
     assert check_bag(small_disk / "bag_1").topics["/pose_6dof"] == ("mems6dof_msgs/msg/Pose6DOF", 1)
     assert node.stop() == 0
+
+
+def test_it_stops_and_starts_again_in_full_traffic(peer: Peer, tmp_path: Path) -> None:
+    """Every message that it took is in one of the bags, each of which is complete."""
+    own = [f"output:={tmp_path / 'bag'}", "topics:=[pose_6dof]"]
+    rclpy.init(args=["--ros-args", *parameters(*own)], signal_handler_options=SignalHandlerOptions.NO)
+    executor = SingleThreadedExecutor()
+    ending = threading.Event()
+    poses = peer.node.create_publisher(Pose6DOF, "pose_6dof", transport.MESSAGES)
+
+    def publish() -> None:
+        for cycle in itertools.count():
+            if ending.wait(0.003):
+                return
+            poses.publish(Pose6DOF(cycle=cycle))
+
+    def spin() -> None:
+        while not ending.is_set():
+            executor.spin_once(timeout_sec=0.05)
+
+    threads = [threading.Thread(target=publish), threading.Thread(target=spin)]
+    try:
+        node = RecorderNode()
+        # What happens between a look at the bag and a message for it, takes time.
+        node._account = lambda received: time.sleep(0.002)  # type: ignore[method-assign]
+        executor.add_node(node)
+        node.bring_up()
+        for thread in threads:
+            thread.start()
+        bags = [tmp_path / "bag", tmp_path / "bag_1", tmp_path / "bag_2"]
+        for bag in bags:
+            peer.wait(lambda: poses.get_subscription_count())
+            time.sleep(0.3)
+            answer = peer.call(Trigger, "recorder/stop")
+            assert (answer.success, answer.message) == (True, str(bag))
+            node.check()
+            if bag != bags[-1]:
+                assert peer.call(Trigger, "recorder/start").success
+    finally:
+        ending.set()
+        for thread in threads:
+            thread.join()
+        executor.shutdown()
+        rclpy.shutdown()
+    node.check()
+    counts = [check_bag(bag).topics["/pose_6dof"][1] for bag in bags]
+    assert min(counts) > 50
+    assert sum(counts) == node.health.total("messages")
 
 
 def test_a_killed_recorder_loses_one_cycle_at_most(domain: int, tmp_path: Path) -> None:

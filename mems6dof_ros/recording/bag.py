@@ -37,7 +37,7 @@ from mems6dof_ros.recording.metadata import (
     metadata_text,
     write_metadata,
 )
-from mems6dof_ros.recording.recover import complete_file, lacks_end, mcap_files
+from mems6dof_ros.recording.recover import being_written, complete_file, hold, lacks_end, mcap_files
 
 __all__ = ["BagReader", "BagWriter", "Channel", "Qos", "Recorded"]
 
@@ -255,6 +255,7 @@ class _File:
         self._provenance = provenance
         self._synced = time.monotonic()
         self._stream = path.open("xb")
+        hold(self._stream)
         # The library also writes offsets to groups of the summary that are empty, which validators refuse.
         self._writer = Writer(self._stream, compression=compression, use_summary_offsets=False)
         try:
@@ -478,6 +479,12 @@ def _readable(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         found = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        cut_off = path.exists() and any(map(lacks_end, mcap_files(path)))
-        advice = "; 'mems6dof recover' completes one that was cut off" if cut_off else ""
-        raise InputError(str(path), found, f"a readable bag{advice}") from error
+        raise InputError(str(path), found, f"a readable bag{_advice(path)}") from error
+
+
+def _advice(path: Path) -> str:
+    """What to do about a bag that cannot be read."""
+    cut_off = [file for file in mcap_files(path) if lacks_end(file)] if path.exists() else []
+    if any(map(being_written, cut_off)):
+        return "; this one is being written"
+    return "; 'mems6dof recover' completes one that was cut off" if cut_off else ""

@@ -7,13 +7,15 @@ is copied, so a long recording takes no second place on the disk.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import io
 import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import IO, BinaryIO, NamedTuple
 
 import yaml
 from mcap import records
@@ -92,8 +94,30 @@ def mcap_files(path: Path) -> list[Path]:
 
 
 def interrupted(path: Path) -> bool:
-    """Is there a bag that its writer could not complete?"""
-    return any(not file.stat().st_size or lacks_end(file) for file in mcap_files(path))
+    """Is there a bag that its writer could not complete? Not one that is being written."""
+    incomplete = [file for file in mcap_files(path) if not file.stat().st_size or lacks_end(file)]
+    return bool(incomplete) and not any(map(being_written, incomplete))
+
+
+def hold(stream: IO[bytes]) -> bool:
+    """Lock a file until it is closed, so that it is known to be written to; False where somebody else has.
+
+    A file system without locks lets everybody.
+    """
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def being_written(file: Path) -> bool:
+    """Has somebody a hold of it? False where it cannot be read."""
+    with contextlib.suppress(OSError), file.open("rb") as stream:
+        return not hold(stream)
+    return False
 
 
 def lacks_end(file: Path) -> bool:
@@ -112,7 +136,7 @@ def recover(path: Path) -> list[Recovered]:
     """Complete an .mcap file, or all those of a bag, whose ``metadata.yaml`` is then written anew.
 
     A file of a bag that was not even begun, because the disk was full, is left out of it. Raises
-    InputError where ``path`` is neither, or a file is no MCAP file at all.
+    InputError where ``path`` is neither, or a file is no MCAP file at all or is being written.
     """
     if not path.is_dir():
         return [complete_file(path).result]
@@ -134,9 +158,11 @@ def recover(path: Path) -> list[Recovered]:
 
 
 def complete_file(path: Path) -> Completed:
-    """Complete one .mcap file; InputError where it is none, or cannot be read or changed."""
+    """Complete one .mcap file; InputError where it is none, is being written, or cannot be read or changed."""
     try:
         with path.open("r+b") as stream:
+            if not hold(stream):
+                raise InputError(str(path), "a file that is being written", "one whose writer has ended")
             size = path.stat().st_size
             if not size:
                 raise InputError(str(path), "an empty file", "an .mcap file with something in it")

@@ -144,6 +144,29 @@ def test_other_files_are_refused_and_left_alone(tmp_path):
         recover(tmp_path / "zero.mcap")
 
 
+def test_a_bag_that_is_being_written_is_left_alone(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        notes = writer.add_channel("/notes", "std_msgs/msg/String")
+        data = messages.serialize(messages.Message("std_msgs/msg/String", {"data": "x"}))
+        for k in range(20):
+            writer.write(notes, data, T0 + k)
+            writer.flush()
+            if k == 5:
+                writer.split()
+        before = (tmp_path / "bag" / "bag_1.mcap").read_bytes()
+        with pytest.raises(InputError, match="bag_1.mcap: found a file that is being written"):
+            recover(tmp_path / "bag")
+        assert (tmp_path / "bag" / "bag_1.mcap").read_bytes() == before
+        with pytest.raises(InputError, match="this one is being written"):
+            BagReader(tmp_path / "bag")
+        assert not interrupted(tmp_path / "bag")
+        for k in range(20, 30):
+            writer.write(notes, data, T0 + k)
+            writer.flush()
+    assert [result.complete for result in recover(tmp_path / "bag")] == [True, True]
+    assert read(tmp_path / "bag") == list(range(30))
+
+
 def test_a_directory_named_like_a_file_is_none(bag):
     (bag / "bag_0.mcap").unlink()
     (bag / "bag_0.mcap").mkdir()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import uuid
 from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.nodes.common import PARENT_VARIABLE
+from mems6dof_ros.nodes.recorder import RUN_VARIABLE
 from mems6dof_ros.nodes.runner import RunningSystem
 from mems6dof_ros.nodes.system import NodeSpec, System, given
 
@@ -27,10 +29,11 @@ def _nodes(system: System, context: Any) -> list[Any]:
     values = {name: context.launch_configurations[name] for name in system.arguments}
     table = system.table(values)
     finite = any(spec.ends_system for spec in table)
-    return [_node(spec, values["namespace"], values["config"], finite) for spec in table]
+    ours = {PARENT_VARIABLE: str(os.getpid()), RUN_VARIABLE: uuid.uuid4().hex}
+    return [_node(spec, values["namespace"], values["config"], finite, ours) for spec in table]
 
 
-def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
+def _node(spec: NodeSpec, namespace: str, config: str, finite: bool, environment: dict[str, str]) -> Any:
     from launch.actions import Shutdown
     from launch_ros.actions import Node
 
@@ -44,7 +47,7 @@ def _node(spec: NodeSpec, namespace: str, config: str, finite: bool) -> Any:
         parameters=[*files, given(spec)],
         remappings=list(spec.remappings.items()),
         output="screen",
-        additional_env={PARENT_VARIABLE: str(os.getpid())},
+        additional_env=environment,
         # Of a finite system, the end of its source and the failure of any node are the end.
         on_exit=Shutdown() if finite else None,
         respawn=spec.respawn,

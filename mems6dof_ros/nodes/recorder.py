@@ -12,6 +12,7 @@ import contextlib
 import datetime
 import functools
 import importlib
+import os
 import shutil
 import sys
 import threading
@@ -36,7 +37,12 @@ from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import COMPRESSIONS, BagWriter, Channel, Qos
 from mems6dof_ros.recording.definitions import definition
+from mems6dof_ros.recording.metadata import read_custom
 from mems6dof_ros.recording.recover import interrupted
+
+#: Environment variable by which the runner, or `launch`, names one run of a system, however often it starts
+#: this node again in it.
+RUN_VARIABLE = "MEMS6DOF_RUN"
 
 #: Types of the topics that we know before anybody publishes them.
 KNOWN_TYPES = {
@@ -129,6 +135,7 @@ class RecorderNode(InstrumentNode):
         self._handing_over = threading.Lock()  # held to put messages, and to put what ends their bag
         self._failed: BagWriter | None = None
         self._bags = 0
+        self._run = os.environ.get(RUN_VARIABLE, "")
         self._closing: Future | None = None  # of the last bag
         #: What is to be done after a flush, and told when done with the file that was the last before.
         self._between: deque[tuple[Callable[[BagWriter], None], Future]] = deque()
@@ -333,16 +340,21 @@ class RecorderNode(InstrumentNode):
         self.health.set("file", bag.file)
 
     def _next_path(self) -> str:
-        """Where to record: ``output``, or beside it where this node has recorded there, or one was killed."""
+        """Where to record: ``output``, or beside it where this node has recorded there, one before it in the
+        same run of a system, or one that was killed."""
         output = self.values["output"]
         if not output:
             return f"recording_{datetime.datetime.now():%Y%m%d_%H%M%S}"
         path = f"{output}_{self._bags}" if self._bags else output
-        while interrupted(Path(path)):
-            self.get_logger().warning(f"{path} was interrupted: mems6dof recover {path}")
+        while (cut_off := interrupted(Path(path))) or self._is_of_this_run(Path(path)):
+            if cut_off:
+                self.get_logger().warning(f"{path} was interrupted: mems6dof recover {path}")
             self._bags += 1
             path = f"{output}_{self._bags}"
         return path
+
+    def _is_of_this_run(self, path: Path) -> bool:
+        return bool(self._run) and read_custom(path).get("run") == self._run
 
     def _open(self) -> None:
         path = self._next_path()
@@ -355,7 +367,7 @@ class RecorderNode(InstrumentNode):
             bag = BagWriter(
                 path,
                 compression=self.values["compression"],
-                provenance={"topics": " ".join(self.values["topics"])},
+                provenance={"topics": " ".join(self.values["topics"]), "run": self._run},
                 sync_period=self.values["sync_period"],
                 split_size=self.values["split_mebibytes"] * _MEBIBYTE,
                 split_duration=self.values["split_duration"],

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import shared_memory, transport
 from mems6dof_ros.nodes.common import PARENT_VARIABLE
 from mems6dof_ros.nodes.parameters import to_yaml
+from mems6dof_ros.nodes.recorder import RUN_VARIABLE
 from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, System, given
 
 
@@ -124,6 +126,7 @@ def run_system(
     ``on_line`` gets every line they print, with the node's name.
     """
     readers = []
+    ours = {PARENT_VARIABLE: str(os.getpid()), RUN_VARIABLE: uuid.uuid4().hex}
 
     def start(node: NodeSpec) -> subprocess.Popen[str]:
         process = subprocess.Popen(
@@ -133,7 +136,7 @@ def run_system(
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env={**_PLAIN_LINES, **environment, **os.environ, PARENT_VARIABLE: str(os.getpid())},
+            env={**_PLAIN_LINES, **environment, **os.environ, **ours},
             start_new_session=True,  # Ctrl-C reaches us alone, and we stop them in order
         )
         reader = threading.Thread(target=_forward, args=(node.executable, process, on_line), daemon=True)

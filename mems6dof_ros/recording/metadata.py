@@ -76,6 +76,15 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], custom: Mapping[s
     unfinished.replace(folder / "metadata.yaml")
 
 
+def read_custom(folder: Path) -> dict[str, str]:
+    """The ``custom`` data of ``metadata.yaml``; empty where there is none that can be read."""
+    try:
+        text = (folder / "metadata.yaml").read_text(encoding="utf-8")
+        return dict(yaml.safe_load(text)["rosbag2_bagfile_information"]["custom_data"])
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, KeyError, ValueError):
+        return {}
+
+
 def metadata_text(files: Sequence[FileSummary], custom: Mapping[str, str]) -> str:
     """The text of rosbag2's metadata.yaml."""
     channels = list(dict.fromkeys(channel for file in files for channel in file.counts))

@@ -158,7 +158,7 @@ def recover(path: Path) -> list[Recovered]:
 
 
 def complete_file(path: Path) -> Completed:
-    """Complete one .mcap file; InputError where it is none, is being written, or cannot be read or changed."""
+    """Complete one .mcap file; InputError where it is none or being written, or cannot be read or changed."""
     try:
         with path.open("r+b") as stream:
             if not hold(stream):

@@ -7,11 +7,13 @@ import os
 import time
 from pathlib import Path
 
-from peers import alive, wait_until
+from peers import PATIENCE, Peer, alive, wait_until
+from std_srvs.srv import Trigger
 
 from mems6dof_ros.nodes.runner import run_system
 from mems6dof_ros.nodes.shared_memory import remove_abandoned
 from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec
+from mems6dof_ros.recording.bag import BagReader
 
 
 def test_only_segments_of_dead_processes_are_removed(tmp_path: Path) -> None:
@@ -54,6 +56,30 @@ def test_what_is_killed_is_started_again_and_leaves_no_memory_behind() -> None:
         second = system.processes["pose_estimator"].pid
         assert system.stop() == {"pose_estimator": 0, "recorder": 0}
     assert not alive(second)
+
+
+def test_a_recorder_that_is_started_again_goes_on_beside_a_complete_bag(peer: Peer, tmp_path: Path) -> None:
+    """But nobody else records where there is a bag already."""
+    output = tmp_path / "bag"
+    recorder = NodeSpec("recorder", {"output": str(output), "topics": ["pose_6dof"]}, respawn=True)
+    lines: list[str] = []
+
+    def recording() -> int:
+        return lines.count("[recorder] INFO recording")
+
+    with run_system([recorder], on_line=lines.append) as system:
+        for number in (1, 2):
+            wait_until(lambda number=number: recording() == number)
+            assert peer.call(Trigger, "recorder/stop").success
+            system.processes["recorder"].kill()
+        wait_until(lambda: recording() == 3)
+        assert system.respawned == {"recorder": 2}
+        assert system.stop() == {"recorder": 0}
+    for suffix in ("", "_1", "_2"):
+        BagReader(f"{output}{suffix}")
+    with run_system([NodeSpec(recorder.executable, recorder.parameters)], on_line=lines.append) as system:
+        assert system.wait("recorder", timeout=PATIENCE) == {"recorder": 1}
+    assert "something there already" in lines[-1]
 
 
 def test_respawn_is_an_argument() -> None:

@@ -7,6 +7,7 @@ the shape of its Gaussian fit places it, from both places where there are two.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,6 +30,9 @@ from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.kernels import pixels
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
 #: Light for which the components must be exact, electrons, and the deviance that what they lack may cost.
 BRIGHT, TRUNCATION = 1e6, 0.3
 #: Particles' own departures are followed along at most so many modes, such as 1e5 electrons can show.
@@ -39,8 +43,8 @@ _SECOND = 60.0
 _POOR, _LEAST_POOR = 4.0, 0.03
 #: Of several particles fitted together, the light of the faintest over that of the brightest, at least.
 LEAST_LIGHT = 0.02
-#: Each of two that one Gaussian took for one has at least this of the median light of the others.
-LEAST_OF_SPLIT = 0.5
+#: Each of two that were taken for one has at least this of the median light of the others.
+LEAST_OF_SPLIT = 0.4
 _MOST_ORDER, _DEGREE = 5, 26
 _BACKGROUND = 10.0  # electrons per pixel, for weights only
 _SAMPLE = 800
@@ -74,7 +78,7 @@ class _Joint(NamedTuple):
     """Particles fitted together: ``of`` (g,): the Gaussian fit that each was in, ``position`` (g, 3) m,
     ``covariance``, ``flags``, the places ``seen`` (g, 2) px and ``light`` (g,) electrons."""
 
-    of: NDArray[np.int64]
+    of: Indices
     position: Array
     covariance: Array
     flags: NDArray[np.uint32]
@@ -201,39 +205,52 @@ class PsfEstimator:
         """``found``, of ``light`` electrons, with particles in each other's light fitted together, and with
         two positions for what one Gaussian was fitted to where the pixels show two particles."""
         unclear = (found.flags & (Flag.POOR_FIT | Flag.NO_Z)) != 0
-        clear = found.position[~unclear, 2]
+        if unclear.all():
+            return found
         # All particles of a body are at about one height: where a fit alone is of no use, that is the start.
-        usual = float(np.median(clear)) if len(clear) else 0.5 * sum(self._z_range)
+        usual = float(np.median(found.position[~unclear, 2]))
         # And of about one light, so that one out of focus is not taken for two.
-        least_light = LEAST_OF_SPLIT * float(np.median(light[~unclear])) if len(clear) else np.inf
+        least_light = LEAST_OF_SPLIT * float(np.median(light[~unclear]))
         z = np.where(unclear, usual, found.position[:, 2])
         places = fits.parameters[:, :2]
-        sharing = groups(places, self._window_px)
-        grouped = np.concatenate([*sharing, np.empty(0, np.int64)])
-        alone = np.setdiff1d(np.flatnonzero(unclear & np.isfinite(places).all(axis=1)), grouped)
-        joints = []
-        for members in [*sharing, *alone[:, None]]:
+        failed = np.isnan(places[:, 0])
+        if fits.sought is not None:
+            # Where the light of several is no Gaussian at all, it is known where they were seen.
+            places = np.where(unclear[:, None], fits.sought, places)
+
+        def explained(members: Indices) -> _Joint | None:
             if len(members) > MOST:
-                continue
+                return None
             if len(members) > 1 and (fit := self._together(image, members, places[members], z[members])):
-                joints.append(fit)
-                continue
+                return fit
             for blob in members[unclear[members]] if len(members) < MOST else ():
                 others = members[members != blob]
-                two = self._two_places(image, fits, int(blob), usual)
+                two = self._two_places(image, places[blob], places[others], usual)
                 if two is None:
                     continue
                 of = np.r_[blob, blob, others]
                 heights = np.r_[usual, usual, z[others]]
                 fit = self._together(image, of, np.concatenate([two, places[others]]), heights)
                 if fit and fit.light[:2].min() > least_light:
-                    joints.append(fit)
-                    break
-        return _replaced(fits, found, joints) if joints else found
+                    return fit
+            return None
 
-    def _together(
-        self, image: NDArray[np.generic], of: NDArray[np.int64], places_px: Array, z: Array
-    ) -> _Joint | None:
+        joints = []
+        todo = groups(places, self._window_px)
+        alone = unclear & np.isfinite(places).all(axis=1)
+        alone[np.concatenate([*todo, np.empty(0, np.int64)])] = False
+        todo += [np.array([one]) for one in np.flatnonzero(alone)]
+        while todo:
+            members = todo.pop()
+            if fit := explained(members):
+                joints.append(fit)
+            elif failed[members].any():
+                # Perhaps nothing was there.
+                rest = members[~failed[members]]
+                todo += [rest[part] for part in groups(places[rest], self._window_px)]
+        return _replaced(fits, found, light, ~unclear, joints) if joints else found
+
+    def _together(self, image: NDArray[np.generic], of: Indices, places_px: Array, z: Array) -> _Joint | None:
         """Joint fit of particles seen at ``places_px`` (g, 2), taken to be at ``z`` (g,) m; None where that
         does not explain the pixels."""
         start, g = self._start(places_px, z), len(z)
@@ -248,30 +265,32 @@ class PsfEstimator:
         seen = start.parameters[:, :2] + start.slopes * start.parameters[:, 2:3]
         return _Joint(of, position, covariance, flags, seen, light)
 
-    def _two_places(
-        self, image: NDArray[np.generic], fits: GaussianFits, blob: int, z: float
-    ) -> Array | None:
-        """Two places (2, 2) px that explain what the Gaussian ``blob`` was fitted to, for heights of ``z`` m;
-        None where there are none, or the image's edge is too near."""
+    def _two_places(self, image: NDArray[np.generic], blob: Array, others: Array, z: float) -> Array | None:
+        """Two places (2, 2) px that explain what is seen about ``blob`` (2,) px beside what is at ``others``
+        (k, 2), for heights of ``z`` m; None where there are none."""
         model, components, window = self._model, self.components, self._window_px
-        start = self._start(fits.parameters[blob : blob + 1, :2], np.array([z]))
+        start = self._start(blob[None], np.array([z]))
         low, high = components.curves.interval
         s = np.clip((2 * start.starts[0, 2] - low - high) / (high - low), -1, 1)
         amplitudes = chebyshev.chebval(s, start.curves[0, 0].T)
         margin = (components.images.shape[1] - window) // 2
         unit = np.tensordot(amplitudes, components.images, 1)[margin:-margin, margin:-margin]
-        column, row = (round(v) for v in fits.parameters[blob, :2])
-        half = window // 2 + REACH
-        part = np.s_[row - half : row + half + 1, column - half : column + half + 1]
-        size = 2 * half + 1
-        if min(row, column) < half or image[part].shape != (size, size):
-            return None
+        middle = np.rint(blob).astype(int)
+        reach = max(REACH, math.ceil(np.abs(others - middle).max(initial=0)))
+        half = window // 2 + reach
+        # Beyond the image's edge nothing is known, and no light is the middle course.
+        columns, rows = (np.arange(c - half, c + half + 1) for c in middle)
+        inside = np.ix_(*((r >= 0) & (r < n) for r, n in zip((rows, columns), image.shape, strict=True)))
+        part = np.ix_(*(r[(r >= 0) & (r < n)] for r, n in zip((rows, columns), image.shape, strict=True)))
         offset, gain, _ = (v[part] if v.size > 1 else v for v in self._camera.maps)
-        electrons = (image[part].astype(float) - offset) / gain
-        places = two_places(
-            electrons - np.percentile(electrons, 20), unit, 0.8 * model.imaging.diameter / self._pixel_size
-        )
-        return None if places is None else places + np.array([column, row])
+        seen = (image[part].astype(float) - offset) / gain
+        if not seen.size:
+            return None
+        electrons = np.zeros((2 * half + 1, 2 * half + 1))
+        electrons[inside] = seen - np.percentile(seen, 20)
+        least = 0.8 * model.imaging.diameter / self._pixel_size
+        places = two_places(electrons, unit, least, others - middle)
+        return None if places is None else places + middle
 
     def _flags(
         self, position: Array, covariance: Array, quality: Array, z_gap: Array, flux: Array
@@ -292,12 +311,14 @@ class PsfEstimator:
         return np.asarray(flags | np.where(failed, Flag.NO_Z, 0), dtype=np.uint32)
 
 
-def _replaced(fits: GaussianFits, found: Positions, joints: Sequence[_Joint]) -> Positions:
-    """``found`` with the particles of ``joints`` in place of what their Gaussian fits gave. Of two that were
-    in one, the second is appended; they share its shape and its light."""
-    of, rows, share = list(range(len(fits))), [], []
+def _replaced(
+    fits: GaussianFits, found: Positions, light: Array, clear: Mask, joints: Sequence[_Joint]
+) -> Positions:
+    """``found``, of ``light`` (n,), with the particles of ``joints`` in place of their Gaussians. Of two that
+    were in one, the second is appended. What was not ``clear`` (n,) has the shape of what was."""
+    shape, usual = np.median(fits.parameters[clear], axis=0), float(np.median(light[clear]))
+    of, rows = list(range(len(fits))), []
     for joint in joints:
-        share.append(joint.light / np.bincount(joint.of, joint.light)[joint.of])
         for number, row in enumerate(joint.of.tolist()):
             if row in joint.of[:number]:
                 of.append(row)
@@ -310,10 +331,14 @@ def _replaced(fits: GaussianFits, found: Positions, joints: Sequence[_Joint]) ->
     flags[rows] = np.concatenate([joint.flags for joint in joints])
     z_gap = found.z_gap[of]
     z_gap[rows] = np.nan
-    fits.parameters[rows, :2] = np.concatenate([joint.seen for joint in joints])
-    fits.parameters[rows, 2] *= np.concatenate(share)
+    parameters = fits.parameters[rows]
+    unlike = ~clear[np.array(of)[rows]]
+    parameters[unlike] = shape
+    parameters[unlike, 2] *= np.concatenate([joint.light for joint in joints])[unlike] / usual
+    parameters[:, :2] = np.concatenate([joint.seen for joint in joints])
+    fits.parameters[rows] = parameters
     # What was said against the Gaussians is explained.
-    fits.flags[rows] &= ~np.uint32(Flag.NEIGHBOUR | Flag.POOR_FIT)
+    fits.flags[rows] &= ~np.uint32(Flag.NEIGHBOUR | Flag.POOR_FIT | Flag.FIT_FAILED)
     return Positions(position, covariance, z_gap, flags, fits)
 
 

@@ -49,33 +49,55 @@ def groups(places_px: Array, window_px: int) -> list[Indices]:
     return [group.astype(np.int64) for group in members]
 
 
-def two_places(electrons: Array, image: Array, least_distance_px: float) -> Array | None:
-    """The two places (2, 2), column and row px from the middle, where two particles explain the window
-    ``electrons`` (s, s), background removed, best; None where one light would be negative.
+def two_places(electrons: Array, image: Array, least_distance_px: float, others: Array) -> Array | None:
+    """The two places (2, 2), column and row px from the middle, where two particles beside those at
+    ``others`` (k, 2) explain the window ``electrons`` (s, s), background removed, best; None where one light
+    would be negative.
 
-    Each looks like ``image`` (w, w) of unit light in its middle, of an odd side that is less than s. Least
-    squares with lights a: ``max |b^T a| = b^T G^-1 b`` for every pair of places, b their correlations
-    with the window and G those of the images with each other.
+    Each looks like ``image`` (w, w) of unit light in its middle, of an odd side; the window holds those of
+    the others. Least squares with lights a: ``max |b^T a| = b^T G^-1 b`` for every pair of places, b their
+    correlations with the window and G those of the images with each other, of both what the others leave.
     """
     half, middle = len(image) // 2, len(electrons) // 2
-    reach = min(REACH, middle - half)
+    reach, others = min(REACH, middle - half), np.rint(others).astype(int)
     turned = np.fft.rfft2(image, electrons.shape)
     matched = np.fft.irfft2(np.fft.rfft2(electrons) * turned.conj(), electrons.shape)
-    side = len(image) + 4 * reach
+    side = len(electrons) + 2 * middle
     alike = np.fft.irfft2(np.abs(np.fft.rfft2(image, (side, side))) ** 2, (side, side))
 
+    def pull(places: NDArray[Any]) -> Array:
+        return matched[tuple((middle - half + places[..., ::-1]).T)].T
+
+    def shared(one: NDArray[Any], other: NDArray[Any]) -> Array:
+        return alike[tuple((other - one)[..., ::-1].T % side)].T
+
+    inverse = np.linalg.pinv(shared(others[:, None], others[None]))
+
     def best(one: NDArray[Any], other: NDArray[Any]) -> Array | None:
-        difference = other - one
-        allowed = np.hypot(*difference.T) >= least_distance_px
-        allowed &= (np.abs(np.concatenate([one, other], axis=1)) <= reach).all(axis=1)
-        one, other, difference = one[allowed], other[allowed], difference[allowed]
+        allowed = (np.abs(np.concatenate([one, other], axis=1)) <= reach).all(axis=1)
+        for first, second in ((one, other[:, None]), (one, others), (other, others)):
+            apart = np.hypot(*np.moveaxis(second - first[:, None], 2, 0))
+            allowed &= apart.min(axis=1, initial=np.inf) >= least_distance_px
+        one, other = one[allowed], other[allowed]
         if not len(one):
             return None
-        first, second = (matched[tuple((middle - half + p[:, ::-1]).T)] for p in (one, other))
-        shared = alike[tuple(difference[:, ::-1].T % side)]
-        determinant = alike[0, 0] ** 2 - shared**2
-        light = (alike[0, 0] * first - shared * second, alike[0, 0] * second - shared * first)
-        gain = np.where(np.minimum(*light) > 0, first * light[0] + second * light[1], -np.inf) / determinant
+        of_one, of_other = (shared(p[:, None], others[None]) for p in (one, other))
+        first, second = (
+            pull(one) - of_one @ inverse @ pull(others),
+            pull(other) - of_other @ inverse @ pull(others),
+        )
+        a, b, c = (
+            shared(p, q) - np.einsum("ni,ij,nj->n", by_p, inverse, by_q)
+            for p, q, by_p, by_q in (
+                (one, one, of_one, of_one),
+                (other, other, of_other, of_other),
+                (one, other, of_one, of_other),
+            )
+        )  # fmt: skip
+        light = (b * first - c * second, a * second - c * first)
+        gain = np.where(np.minimum(*light) > 0, first * light[0] + second * light[1], -np.inf) / (
+            a * b - c**2
+        )
         index = int(np.argmax(gain))
         return np.array([one[index], other[index]]) if gain[index] > 0 else None
 

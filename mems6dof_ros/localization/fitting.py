@@ -71,7 +71,8 @@ def fit_gaussians(
     flags[np.isnan(parameters[:, 0])] |= np.uint32(Flag.FIT_FAILED)
     flags[quality[:, 2] * 7 > window_px] |= np.uint32(Flag.WINDOW_CUT)
     flags[quality[:, 3] > 0] |= np.uint32(Flag.SATURATED)
-    return GaussianFits(parameters, covariance, quality[:, 0], quality[:, 1].astype(np.int32), flags)
+    iterations = quality[:, 1].astype(np.int32)
+    return GaussianFits(parameters, covariance, quality[:, 0], iterations, flags, positions)
 
 
 def check_fit(weighting: str, window_px: int) -> None:

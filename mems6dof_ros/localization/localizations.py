@@ -36,7 +36,8 @@ class GaussianFits:
     ``parameters`` (n, 7) in the order of FIT_PARAMETERS: positions in px of the whole image with
     pixel centres at integers (column, row), amplitude and background in electrons per pixel.
     ``covariance`` (n, 7, 7) in the same units; ``chi_square`` (n,) reduced; ``iterations`` (n,);
-    ``flags`` (n,) of Flag. A failed fit keeps its place, with NaN parameters and FIT_FAILED.
+    ``flags`` (n,) of Flag. A failed fit keeps its place, with NaN parameters and FIT_FAILED. ``sought``
+    (n, 2) px: where the fits began; None where nobody knows any more.
     """
 
     parameters: NDArray[np.float64]
@@ -44,6 +45,7 @@ class GaussianFits:
     chi_square: NDArray[np.float64]
     iterations: NDArray[np.int32]
     flags: NDArray[np.uint32]
+    sought: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -56,6 +58,7 @@ class GaussianFits:
             self.chi_square[index],
             self.iterations[index],
             self.flags[index],
+            None if self.sought is None else self.sought[index],
         )
 
     @cached_property

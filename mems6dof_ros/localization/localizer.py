@@ -81,23 +81,29 @@ class Localizer:
         if candidates is None:
             candidates = detect(frame.image, self.settings.detection)
         fits = fit_gaussians(frame.image, candidates, self.camera, self._weighting, self._window_px)
-        fits = _take(fits, _first_of_each(fits, self.settings.detection.separation_px / 2))
+        again = _again(fits, self.settings.detection.separation_px / 2)
+        # Perhaps a fit to the light of several, in which they can yet be told apart: it keeps its place.
+        fits.parameters[again], fits.covariance[again] = np.nan, np.nan
+        fits.flags[again] |= np.uint32(Flag.FIT_FAILED)
         fits.flags[:] |= self._quality_flags(fits, pixel_size)
         if self.calibration:
             found = self.calibration.locate(fits, frame.image)
             fits = fits if found.fits is None else found.fits
         else:
             found = _lateral_positions(fits, pixel_size, frame.image.shape)
+        keep = (fits.flags & Flag.FIT_FAILED) == 0
+        keep[: len(again)] |= ~again
+        fits = fits[keep]
         return Localizations(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
             frame_counter=frame.frame_counter,
             cycle=frame.cycle,
-            position=found.position,
-            covariance=found.covariance,
+            position=found.position[keep],
+            covariance=found.covariance[keep],
             fits=fits,
-            z_gap=found.z_gap,
-            flags=fits.flags | found.flags.astype(np.uint32),
+            z_gap=found.z_gap[keep],
+            flags=fits.flags | found.flags[keep].astype(np.uint32),
             calibration_id=self.calibration.calibration_id if self.calibration else "",
             frames_dropped=frame.frames_dropped,
             frame_published_ns=frame.published_ns,
@@ -158,24 +164,14 @@ def misfit(fits: GaussianFits, window_px: int) -> NDArray[np.float64]:
     return np.sqrt(excess * degrees / fits.flux)
 
 
-def _take(fits: GaussianFits, chosen: NDArray[np.bool_]) -> GaussianFits:
-    return GaussianFits(
-        fits.parameters[chosen],
-        fits.covariance[chosen],
-        fits.chi_square[chosen],
-        fits.iterations[chosen],
-        fits.flags[chosen],
-    )
-
-
-def _first_of_each(fits: GaussianFits, distance_px: float) -> NDArray[np.bool_]:
-    """Without the fits that have wandered to a particle that an earlier candidate found."""
-    first = np.ones(len(fits), dtype=bool)
+def _again(fits: GaussianFits, distance_px: float) -> NDArray[np.bool_]:
+    """Fits that have wandered to a particle that an earlier candidate found."""
+    again = np.zeros(len(fits), dtype=bool)
     good = np.nonzero((fits.flags & Flag.FIT_FAILED) == 0)[0]
     for a, b in kernels.close_pairs(fits.parameters[good, :2], distance_px):
-        if first[good[a]]:
-            first[good[b]] = False
-    return first
+        if not again[good[a]]:
+            again[good[b]] = True
+    return again
 
 
 def _disturbed(fits: GaussianFits, distance_px: float, least_flux: float) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--optical-cycles",
         type=int,
-        default=240,
+        default=720,
         help="cycles from rendered frames, calibration included, on the optics of the first three seeds;"
         " after the first revolution, 80 cycles, they count; 0: none (default: %(default)s)",
     )

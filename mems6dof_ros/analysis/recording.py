@@ -24,6 +24,9 @@ _LOCALIZATIONS = "mems6dof_msgs/msg/Localizations"
 _TRUTH = "mems6dof_msgs/msg/GroundTruth"
 _FRAME_INFO = "mems6dof_msgs/msg/FrameInfo"
 
+#: Displacement of the reference from itself, m or rad: nothing but rounding.
+ZERO = 1e-12
+
 
 @dataclass(frozen=True)
 class Constellation:
@@ -155,6 +158,25 @@ def _expressed(pose: CyclePose, moved: RigidPose, version: int, origin: NDArray[
     )
 
 
+def _sessions_apart(poses: list[CyclePose]) -> list[CyclePose]:
+    """``poses``, references and particles of an estimator that was started again numbered on from those
+    before: it counts both from the first, and they are others. Its reference is its first valid pose."""
+    apart: list[CyclePose] = []
+    last = versions = particles = beyond = 0
+    for pose in poses:
+        founded = pose.valid and pose.increment_cycles == 0 and np.abs(pose.displacement).max() < ZERO
+        if founded and last and pose.reference_version + versions <= last:
+            versions, particles = last, beyond
+        if versions:
+            moved = np.where(pose.particle_id >= 0, pose.particle_id + particles, -1).astype(np.int32)
+            version = pose.reference_version + versions
+            pose = replace(pose, reference_version=version, particle_id=moved)
+        if pose.valid:
+            last, beyond = pose.reference_version, max(beyond, int(pose.particle_id.max(initial=-1)) + 1)
+        apart.append(pose)
+    return apart
+
+
 def load_recording(path: str | Path) -> Recording:
     """Read a bag of measurements, whatever the names of its topics; InputError where it holds no poses."""
     poses: dict[str, list[CyclePose]] = {}
@@ -179,8 +201,9 @@ def load_recording(path: str | Path) -> Recording:
         provenance = bag.provenance()
     if not poses:
         raise InputError(str(path), "no poses", f"a bag with messages of type {_POSE}")
-    for series in poses.values():
+    for body, series in poses.items():
         series.sort(key=lambda pose: (pose.stamp_ns, pose.frame_counter))
+        poses[body] = _sessions_apart(series)
     where = Path(path).resolve()
     name = f"{where.parent.name}/{where.name}"
     return Recording(name, provenance, poses, localizations, truths, frames, dropped)

@@ -61,11 +61,15 @@ class PoseEstimator:
     ) -> None:
         self.settings = settings or PoseSettings()
         self.body, self.region, self.reference, self.field = body, region, reference, field
-        self.reset()
+        self._next_id = 0  # versions and identities are never used twice
+        self._begin(1)
 
     def reset(self) -> None:
-        """Forget everything measured: the next cycle founds a new constellation, reference version 1."""
-        self._frame = BodyFrame(1, np.eye(3), np.zeros(3), np.zeros(3), 0.0)
+        """Forget everything measured: the next cycle founds a new constellation and reference."""
+        self._begin(self._frame.version + (self._last is not None))
+
+    def _begin(self, version: int) -> None:
+        self._frame = BodyFrame(version, np.eye(3), np.zeros(3), np.zeros(3), 0.0)
         self._last_frame: tuple[int, int] | None = None
         self._forget()
 
@@ -79,7 +83,6 @@ class PoseEstimator:
         self._last: State | None = None
         self._steps: deque[float] = deque(maxlen=15)
         self._recentred = 0
-        self._next_id = 0
         # Squared residuals over degrees of freedom, in xy and z: the noise against what is claimed.
         self._noise = np.full((2, 2), NOISE_PRIOR)
         self._half_field = np.zeros(2)
@@ -192,7 +195,7 @@ class PoseEstimator:
         """Start from the constellation of an earlier session."""
         constellation = self._empty_constellation(view)
         constellation.adopt(reference.ids, reference.position, reference.covariance)
-        self._next_id = int(reference.ids.max(initial=-1)) + 1
+        self._next_id = max(self._next_id, int(reference.ids.max(initial=-1)) + 1)
         self.constellation = constellation
 
     def _empty_constellation(self, view: Usable) -> Constellation:

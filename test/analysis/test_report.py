@@ -121,6 +121,27 @@ def test_earlier_references_are_expressed_in_the_last_one(bag):
             assert after is before
 
 
+def test_an_estimator_that_was_started_again_has_other_references_and_particles(bag, tmp_path):
+    """The same poses once more, two seconds later, as from a new process: versions and particles count on."""
+    twice = tmp_path / "twice"
+    with BagReader(bag) as reader, BagWriter(twice) as writer:
+        kept = [m for m in reader.messages() if m[1].endswith("Pose6DOF")]
+        for later in (0, 2_000_000_000):
+            for topic, kind, time, message in kept:
+                pose = messages.to_cycle_pose(message)
+                pose = replace(pose, stamp_ns=pose.stamp_ns + later)
+                channel = writer.add_channel(topic, kind)
+                writer.write(channel, messages.serialize(messages.pose6dof(pose)), time + later)
+    once, poses = (load_recording(path).poses["load_gear"] for path in (bag, twice))
+    first, second = poses[: len(once)], poses[len(once) :]
+    last = max(pose.reference_version for pose in once)
+    assert [pose.reference_version for pose in first] == [pose.reference_version for pose in once]
+    assert [pose.reference_version for pose in second] == [pose.reference_version + last for pose in once]
+    ids = [{*np.concatenate([pose.particle_id for pose in part]).tolist()} - {-1} for part in (first, second)]
+    assert not ids[0] & ids[1]
+    assert len(ids[0]) == len(ids[1])
+
+
 def test_the_constellation_is_the_true_one(bag):
     """Positions in the body frame against the simulator's, after the rigid motion between the two frames."""
     recording = load_recording(bag)

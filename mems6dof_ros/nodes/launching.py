@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import uuid
-from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.nodes.common import PARENT_VARIABLE
 from mems6dof_ros.nodes.recorder import RUN_VARIABLE
 from mems6dof_ros.nodes.runner import RunningSystem
-from mems6dof_ros.nodes.system import NodeSpec, System, given
+from mems6dof_ros.nodes.system import NodeSpec, System, arguments, given, parameter_file
 
 
 def description(system: System) -> Any:
@@ -18,11 +17,11 @@ def description(system: System) -> Any:
     from launch import LaunchDescription
     from launch.actions import DeclareLaunchArgument, OpaqueFunction
 
-    arguments = [
+    declared = [
         DeclareLaunchArgument(name, default_value=default, description=doc)
         for name, (default, doc) in system.arguments.items()
     ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=lambda context: _nodes(system, context))])
+    return LaunchDescription([*declared, OpaqueFunction(function=lambda context: _nodes(system, context))])
 
 
 def _nodes(system: System, context: Any) -> list[Any]:
@@ -38,13 +37,14 @@ def _node(spec: NodeSpec, namespace: str, config: str, finite: bool, environment
     from launch_ros.actions import Node
 
     grace, grace_after = RunningSystem.GRACE
-    files = [os.fspath(Path(config) / f"{spec.executable}.yaml")] if config else []
+    files = [os.fspath(parameter_file(spec, config))] if config else []
     return Node(
         package="mems6dof_ros",
         executable=spec.executable,
         name=spec.executable,
         namespace=namespace,
-        parameters=[*files, given(spec)],
+        ros_arguments=arguments(spec.defaults),  # before the files on the command line
+        parameters=[*files, given(spec.parameters)],
         remappings=list(spec.remappings.items()),
         output="screen",
         additional_env=environment,

@@ -17,15 +17,13 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import shared_memory, transport
 from mems6dof_ros.nodes.common import PARENT_VARIABLE
-from mems6dof_ros.nodes.parameters import to_yaml
 from mems6dof_ros.nodes.recorder import RUN_VARIABLE
-from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, System, given
+from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, System, arguments, parameter_file
 
 
 class RunningSystem:
@@ -161,16 +159,15 @@ _PLAIN_LINES = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": "{severity} {message}"}
 
 def command(node: NodeSpec, namespace: str = "", config: str = "") -> list[str]:
     """The command line of a node."""
-    arguments = [sys.executable, "-m", f"mems6dof_ros.nodes.{node.executable}", "--ros-args"]
+    words = [sys.executable, "-m", f"mems6dof_ros.nodes.{node.executable}", "--ros-args"]
     if namespace:
-        arguments += ["-r", f"__ns:=/{namespace.strip('/')}"]
+        words += ["-r", f"__ns:=/{namespace.strip('/')}"]
     for before, after in node.remappings.items():
-        arguments += ["-r", f"{before}:={after}"]
+        words += ["-r", f"{before}:={after}"]
+    words += arguments(node.defaults)
     if config:
-        arguments += ["--params-file", str(Path(config) / f"{node.executable}.yaml")]
-    for name, value in given(node).items():
-        arguments += ["-p", f"{name}:={to_yaml(value)}"]
-    return arguments
+        words += ["--params-file", str(parameter_file(node, config))]
+    return words + arguments(node.parameters)
 
 
 def _forward(name: str, process: subprocess.Popen[str], on_line: Callable[[str], None]) -> None:
@@ -179,13 +176,13 @@ def _forward(name: str, process: subprocess.Popen[str], on_line: Callable[[str],
         on_line(f"[{name}] {line.rstrip()}")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Run a system until its source ends or a signal comes; returns 0, or 1 where a node failed."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    words = sys.argv[1:] if words is None else words
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     try:
-        system, values = _parse(arguments)
+        system, values = _parse(words)
         nodes = system.table(values)
         last = [node.executable for node in nodes if node.ends_system]
         with run_system(
@@ -205,16 +202,16 @@ def _interrupt(*_: Any) -> None:
     raise KeyboardInterrupt
 
 
-def _parse(arguments: Sequence[str]) -> tuple[System, dict[str, str]]:
-    if not arguments or arguments[0] not in SYSTEMS:
-        raise InputError("arguments", " ".join(arguments) or "nothing", f"one of {', '.join(SYSTEMS)}")
+def _parse(words: Sequence[str]) -> tuple[System, dict[str, str]]:
+    if not words or words[0] not in SYSTEMS:
+        raise InputError("arguments", " ".join(words) or "nothing", f"one of {', '.join(SYSTEMS)}")
     values = {}
-    for argument in arguments[1:]:
+    for argument in words[1:]:
         name, separator, value = argument.partition(":=")
         if not separator:
             raise InputError("arguments", f"'{argument}'", "name:=value")
         values[name] = value
-    return SYSTEMS[arguments[0]], values
+    return SYSTEMS[words[0]], values
 
 
 if __name__ == "__main__":

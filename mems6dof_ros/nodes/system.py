@@ -6,14 +6,18 @@ files in ``launch_scripts/`` hand these tables to `launch`, ``runner`` starts th
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.nodes.common import WAIT_PARAMETER
+from mems6dof_ros.nodes.parameters import to_yaml
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
 from mems6dof_ros.pose.bodies_file import load_bodies
 from mems6dof_ros.recording import topics
@@ -40,8 +44,8 @@ _SUBSCRIBED = {
 class NodeSpec:
     """One node of a system: ``executable`` of this package, with its parameters and remappings.
 
-    ``ends_system``: when this process ends, the others have nothing left to do. ``respawn``: when it fails or
-    is killed, it is started again.
+    ``parameters`` win over a parameter file, which wins over ``defaults``. ``ends_system``: when this process
+    ends, the others have nothing left to do. ``respawn``: when it fails or is killed, it is started again.
     """
 
     executable: str
@@ -49,6 +53,7 @@ class NodeSpec:
     remappings: Mapping[str, str] = field(default_factory=dict)
     ends_system: bool = False
     respawn: bool = False
+    defaults: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -71,9 +76,33 @@ class System:
 # Tables ------------------------------------------------------------------------------------------
 
 
-def given(node: NodeSpec) -> dict[str, Any]:
-    """The parameters of a node that can be handed over: ROS 2 has no way to write an empty list or text."""
-    return {name: value for name, value in node.parameters.items() if value not in ("", [], ())}
+def given(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Those that can be handed over: ROS 2 has no way to write an empty list or text."""
+    return {name: value for name, value in parameters.items() if value not in ("", [], ())}
+
+
+def arguments(parameters: Mapping[str, Any]) -> list[str]:
+    """Parameters as ROS arguments; what comes later on a command line, files included, wins."""
+    return [word for name, value in given(parameters).items() for word in ("-p", f"{name}:={to_yaml(value)}")]
+
+
+def parameter_file(node: NodeSpec, config: str) -> Path:
+    """The parameter file of a node in the directory ``config``."""
+    return Path(config) / f"{node.executable}.yaml"
+
+
+def expected(node: NodeSpec, name: str, config: str) -> Any:
+    """The value that a parameter will have, as far as the table and the parameter file tell."""
+    if name in node.parameters:
+        return node.parameters[name]
+    value = None
+    if config:
+        # A file that cannot be read is refused by the node.
+        with contextlib.suppress(OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError):
+            document = yaml.safe_load(parameter_file(node, config).read_text(encoding="utf-8"))
+            for of_node in document.values():
+                value = of_node["ros__parameters"].get(name, value)
+    return node.defaults.get(name) if value is None else value
 
 
 def chain(
@@ -82,14 +111,16 @@ def chain(
     calibration: str,
     bodies: str = "",
     output: str = "",
-    queue_policy: str = "block",
+    queue_policy: str = "",
     image_topic: str = topics.IMAGE,
-    recorded: Sequence[str] = DEFAULT_TOPICS,
-    compression: str = "none",
+    recorded: Sequence[str] = (),
+    record_images: bool = False,
+    compression: str = "",
     controller: NodeSpec | None = None,
     watched: Mapping[str, str] | None = None,
     monitor: NodeSpec | None = None,
     arrangement: str = "processes",
+    config: str = "",
 ) -> list[NodeSpec]:
     """frame_source, localizer, pose_estimator, ``controller`` if any, with an ``output`` recorder, and
     ``monitor`` if any. ``arrangement`` pipeline: the first three in one process.
@@ -97,10 +128,11 @@ def chain(
     ``source`` None: a camera driver of somebody else publishes ``image_topic``. Each node waits for the
     subscribers that the table gives it, and for those in ``watched`` (topic to the name of a node that is
     not in the table), so that nothing is lost at the beginning. Nobody waits for a monitor. ``bodies``: file
-    of several bodies in view, whose topics are recorded too.
+    of several bodies in view, whose topics are recorded too. What is empty is left to the parameter files in
+    ``config``, then to the nodes; ``record_images`` adds them to what is ``recorded``.
     """
     further = _topics_of_further(bodies)
-    queue = {"queue_policy": queue_policy}
+    queue = {"queue_policy": queue_policy} if queue_policy else {}
     remap = {topics.IMAGE: image_topic} if image_topic != topics.IMAGE else {}
     if arrangement == "pipeline":
         nodes = [_in_one_process(source, calibration, bodies)]
@@ -113,16 +145,21 @@ def chain(
     if controller:
         nodes.append(controller)
     if output:
-        recorder = {
+        told = {
             "output": output,
-            "topics": [*recorded, *further],
             "compression": compression,
             "attachments": [file for file in (calibration, bodies) if file],
         }
-        nodes.append(NodeSpec("recorder", recorder, remap))
+        if recorded:
+            told["topics"] = [*recorded, *further]
+        recorder = NodeSpec("recorder", told, remap, defaults={"topics": [*DEFAULT_TOPICS, *further]})
+        if record_images:
+            names = dict.fromkeys([*expected(recorder, "topics", config), topics.IMAGE])
+            recorder = replace(recorder, parameters={**told, "topics": list(names)})
+        nodes.append(recorder)
     if monitor:
         nodes.append(replace(monitor, remappings=remap))
-    subscribed = [(topic, node.executable) for node in nodes for topic in _subscriptions(node)]
+    subscribed = [(topic, node.executable) for node in nodes for topic in _subscriptions(node, config)]
     subscribed += (watched or {}).items()
     return [_waiting_for_subscribers(node, subscribed, further) for node in nodes]
 
@@ -181,9 +218,9 @@ def _waiting_for_subscribers(
     return replace(node, parameters={**node.parameters, WAIT_PARAMETER.name: waits}) if waits else node
 
 
-def _subscriptions(node: NodeSpec) -> Sequence[str]:
+def _subscriptions(node: NodeSpec, config: str) -> Sequence[str]:
     if node.executable == "recorder":
-        return list(node.parameters["topics"])
+        return list(expected(node, "topics", config))
     if node.executable in ("frame_source", "pipeline"):
         paced = node.parameters.get("pacing") == "consumer"
         return [node.parameters["acknowledged_by"]] if paced else []
@@ -191,13 +228,22 @@ def _subscriptions(node: NodeSpec) -> Sequence[str]:
 
 
 def _live(values: Mapping[str, str]) -> list[NodeSpec]:
-    source = None
-    if values["source"] != "none":
-        parameters = {"source": values["source"], "pacing": "rate", "rate": _number(values, "rate")}
-        source = NodeSpec("frame_source", parameters)
-    image_topic = values["image_topic"]
-    nodes = chain(source, queue_policy="drop_oldest", image_topic=image_topic, **_common(values))
+    source = None if values["source"] == "none" else _camera(values, rate=10.0)
+    nodes = chain(source, image_topic=values["image_topic"], **_common(values))
+    newest = {"queue_policy": "drop_oldest"}
+    measuring = ("localizer", "pose_estimator")
+    nodes = [_with(node, newest, by_default=True) if node.executable in measuring else node for node in nodes]
     return _respawning(_tracking(nodes, values), values)
+
+
+def _camera(values: Mapping[str, str], rate: float) -> NodeSpec:
+    """A frame_source at its own pace."""
+    told: dict[str, Any] = {"pacing": "rate"}
+    if values["source"]:
+        told["source"] = values["source"]
+    if values["rate"]:
+        told["rate"] = _number(values, "rate")
+    return NodeSpec("frame_source", told, defaults={"source": "simulator", "rate": rate})
 
 
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -207,24 +253,24 @@ def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
 
 
 def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
-    size = _whole(values, "size")
-    source = simulated(
-        _whole(values, "cycles"),
-        width_px=size,
-        height_px=size,
-        seed=_whole(values, "seed"),
-        optics_seed=_whole(values, "optics_seed"),
-    )
-    return chain(source, **_common(values))
+    return chain(simulated(_whole(values, "cycles"), **_simulation(values)), **_common(values))
 
 
 def _closed_loop(values: Mapping[str, str]) -> list[NodeSpec]:
-    size = _whole(values, "size")
-    source = commanded(
-        width_px=size, height_px=size, seed=_whole(values, "seed"), optics_seed=_whole(values, "optics_seed")
-    )
+    source = commanded(**_simulation(values))
     controller = NodeSpec("controller", {"law": values["law"]})
     return _respawning(chain(source, controller=controller, **_common(values)), values)
+
+
+def _simulation(values: Mapping[str, str]) -> dict[str, int]:
+    """What is told of size and seeds."""
+    fields = {"size": ("width_px", "height_px"), "seed": ("seed",), "optics_seed": ("optics_seed",)}
+    return {
+        name: _whole(values, argument)
+        for argument, names in fields.items()
+        for name in names
+        if values[argument]
+    }
 
 
 def _calibrate(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -233,23 +279,18 @@ def _calibrate(values: Mapping[str, str]) -> list[NodeSpec]:
     calibrator = NodeSpec("calibrator", remappings=remap)
     if values["source"] == "none":
         return [calibrator]
-    camera = {"source": values["source"], "pacing": "rate", "rate": _number(values, "rate")}
-    if values["source"] != "simulator":
-        return [NodeSpec("frame_source", camera), calibrator]
-    size = _whole(values, "size")
-    simulated_substrate = {
-        "simulator.substrate": True,
-        "simulator.substrate_beads": max(200 * size**2 // 2048**2, 12),
-        "simulator.width_px": size,
-        "simulator.height_px": size,
-        "simulator.seed": _whole(values, "seed"),
-        "simulator.optics_seed": _whole(values, "optics_seed"),
-    }
+    camera = _camera(values, rate=5.0)
+    if expected(camera, "source", values["config"]) != "simulator":
+        return [camera, calibrator]
     simulation = SimulationSettings()
+    told = _simulation(values)
+    size = told.get("width_px", simulation.width_px)
+    substrate = {"substrate": True, "substrate_beads": max(200 * size**2 // 2048**2, 12), **told}
+    parameters = {**camera.parameters, **{f"simulator.{name}": value for name, value in substrate.items()}}
     noise = json.loads(camera_to_json(camera_noise(simulation)))
     known = {f"camera.{name}": float(value) for name, value in noise.items()}
     known |= {"wavelength": simulation.wavelength, "bead_diameter": simulation.diameter}
-    return [NodeSpec("frame_source", camera | simulated_substrate), replace(calibrator, parameters=known)]
+    return [replace(camera, parameters=parameters), replace(calibrator, parameters=known)]
 
 
 def _common(values: Mapping[str, str]) -> dict[str, Any]:
@@ -258,6 +299,8 @@ def _common(values: Mapping[str, str]) -> dict[str, Any]:
         "calibration": values["calibration"],
         "bodies": values["bodies"],
         "output": values["output"],
+        "record_images": _truth(values, "record_images"),
+        "config": values["config"],
         "monitor": _monitor(values),
         "arrangement": values["arrangement"],
     }
@@ -267,19 +310,28 @@ def _monitor(values: Mapping[str, str]) -> NodeSpec | None:
     return NodeSpec("monitor") if _truth(values, "monitor") else None
 
 
-def with_tracking(nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
-    """The ``nodes``, particles tracked and not searched in every frame."""
+def with_tracking(
+    nodes: Sequence[NodeSpec], enabled: bool = True, *, by_default: bool = False
+) -> list[NodeSpec]:
+    """The ``nodes``, particles tracked and not searched in every frame, or, not ``enabled``, the reverse."""
+    told = {"tracking.enabled": enabled}
     return [
-        replace(node, parameters={**node.parameters, "tracking.enabled": True})
-        if node.executable in ("localizer", "pipeline")
-        else node
+        _with(node, told, by_default) if node.executable in ("localizer", "pipeline") else node
         for node in nodes
     ]
 
 
+def _with(node: NodeSpec, parameters: Mapping[str, Any], by_default: bool) -> NodeSpec:
+    if by_default:
+        return replace(node, defaults={**node.defaults, **parameters})
+    return replace(node, parameters={**node.parameters, **parameters})
+
+
 def _tracking(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
-    """With the tracking that the argument asks for, where there is but one body to follow."""
-    return with_tracking(nodes) if _truth(values, "tracking") and not values["bodies"] else nodes
+    """With the tracking that is told, else by default, where there is but one body to follow."""
+    if values["tracking"]:
+        return with_tracking(nodes, _truth(values, "tracking") and not values["bodies"])
+    return nodes if values["bodies"] else with_tracking(nodes, by_default=True)
 
 
 def _respawning(nodes: list[NodeSpec], values: Mapping[str, str]) -> list[NodeSpec]:
@@ -314,11 +366,20 @@ _REPLAYING: Mapping[str, Callable[[Mapping[str, str], str], float]] = {
     "start_paused": _truth,
     "publish_clock": _truth,
 }
+_EMPTY = "empty: what the parameter file says, else"
+_SOURCE = (
+    "",
+    f"Source of the frames; {_EMPTY} simulator; none: a camera driver publishes image_topic",
+)
+_RATE = "Frames per second, 0.0: as the source delivers them"
 _CALIBRATION = {
     "calibration": ("", "Calibration file; empty: x and y only"),
     "bodies": ("", "File of several rigid bodies in view (docs/files.md); empty: one"),
 }
-_OUTPUT = {"output": ("", "Directory of the bag to record; empty: none")}
+_OUTPUT = {
+    "output": ("", "Directory of the bag to record; empty: none"),
+    "record_images": ("false", "true: record the images, too"),
+}
 _ARRANGEMENT = {
     "arrangement": (
         "processes",
@@ -327,9 +388,9 @@ _ARRANGEMENT = {
 }
 _TRACKING = {
     "tracking": (
-        "true",
-        "Fit where the motion of the one body says that its particles will be, and search whole frames now"
-        " and then; false: search every frame. Of several bodies none is followed",
+        "",
+        "true: fit where the motion of the one body says that its particles will be, and search whole frames"
+        f" now and then; false: search every frame; {_EMPTY} true. Of several bodies none is followed",
     )
 }
 _MONITOR = {"monitor": ("false", "true: show it live to browsers on this machine, see docs/monitor.md")}
@@ -337,9 +398,9 @@ _RESPAWN = {"respawn": ("false", "true: start a node again, after a second, that
 _CONFIG = {"config": ("", "Directory of parameter files, <node>.yaml each; empty: defaults")}
 _NAMESPACE = {"namespace": ("", "Namespace of the nodes and their topics")}
 _SIMULATION = {
-    "size": ("2048", "Width and height of the frames, px"),
-    "seed": ("1", "Seed of particles, motion and noise"),
-    "optics_seed": ("1", "Seed of the optics; must be that of the calibration"),
+    "size": ("", f"Width and height of the frames, px; {_EMPTY} 2048"),
+    "seed": ("", f"Seed of particles, motion and noise; {_EMPTY} 1"),
+    "optics_seed": ("", f"Seed of the optics, must be that of the calibration; {_EMPTY} 1"),
 }
 
 SYSTEMS = {
@@ -347,8 +408,8 @@ SYSTEMS = {
         "A source at its own pace; what cannot be kept up with is dropped, oldest first, and counted.",
         {
             **_CALIBRATION,
-            "source": ("simulator", "Source of the frames; none: a camera driver publishes image_topic"),
-            "rate": ("10.0", "Frames per second; 0.0: as the source delivers them"),
+            "source": _SOURCE,
+            "rate": ("", f"{_RATE}; {_EMPTY} 10.0"),
             "image_topic": (topics.IMAGE, "Topic of the images"),
             **_OUTPUT,
             **_ARRANGEMENT,
@@ -411,8 +472,8 @@ SYSTEMS = {
     "calibrate": System(
         "A camera over a substrate of beads, a stage, and the calibrator, which waits for 'mems6dof scan'.",
         {
-            "source": ("simulator", "Source of the frames; none: a camera driver publishes image_topic"),
-            "rate": ("5.0", "Frames per second; 0.0: as the source delivers them"),
+            "source": _SOURCE,
+            "rate": ("", f"{_RATE}; {_EMPTY} 5.0"),
             "image_topic": (topics.IMAGE, "Topic of the images"),
             **_SIMULATION,
             **_CONFIG,

@@ -181,6 +181,38 @@ def test_infos_behind_their_images_are_waited_for() -> None:
     assert matcher.take(True) == [("image 9", "info 9", 0)]
 
 
+def test_images_from_memory_and_by_the_topic_keep_the_order_of_the_infos() -> None:
+    """The first frame came from memory; then the topic kept but ten images while nobody took them."""
+    matcher = FrameMatcher()
+    matcher.add_info(0, 0, "memory", 0)
+    taken = matcher.take(True)
+    for stamp in range(5, 15):
+        matcher.add_image(stamp, "topic", 0)
+    for stamp in range(1, 15):
+        matcher.add_info(stamp, stamp, "memory" if stamp < 8 else None, 0)
+        taken += matcher.take(True)
+    assert [(frame.info, frame.image) for frame in taken] == [
+        (stamp, "memory" if stamp < 8 else "topic") for stamp in range(15)
+    ]
+    assert matcher.take(False) == []
+
+
+def test_what_is_lost_on_the_topic_holds_up_nobody() -> None:
+    matcher = FrameMatcher(patience=2)
+    for stamp in range(1, 5):
+        matcher.add_info(stamp, stamp, "memory" if stamp in (2, 3) else None, 0)
+    assert matcher.take(True) == []
+    assert matcher.lacks_image
+    matcher.add_image(2, "topic", 0)  # which 1 would have come before
+    assert [frame.info for frame in matcher.take(True)] == [2, 3]
+    matcher.tick()
+    matcher.tick()
+    assert matcher.take(True) == []
+    assert not matcher.lacks_image
+    matcher.add_info(5, 5, "memory", 0)
+    assert [frame.info for frame in matcher.take(True)] == [5]
+
+
 def test_stamps_may_begin_again() -> None:
     matcher = FrameMatcher()
     matcher.add_info(100, "info 100")
@@ -309,6 +341,7 @@ def test_launch_files_start_the_same_table(name: str) -> None:
         file, parameters = node.options["parameters"]
         assert file == f"settings/{spec.executable}.yaml"
         assert parameters.items() <= spec.parameters.items()
+        assert len(node.options["ros_arguments"]) == 2 * len(spec.defaults)
         assert bool(node.options["on_exit"]) == any(spec.ends_system for spec in table)
 
 

@@ -8,17 +8,22 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+import yaml
 from peers import PATIENCE, SMALL_GEAR, alive, own_domain, wait_until
+from rclpy.context import Context
+from rclpy.node import Node
 
 from mems6dof_ros.calibration.file import load_calibration
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.localizer import Localizer
 from mems6dof_ros.nodes.recorder import DEFAULT_TOPICS
 from mems6dof_ros.nodes.runner import RunningSystem, command, run_system
-from mems6dof_ros.nodes.system import SYSTEMS, chain, simulated
+from mems6dof_ros.nodes.system import SYSTEMS, NodeSpec, chain, expected, simulated
 from mems6dof_ros.pose.cycle_pose import Status
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages
@@ -241,7 +246,7 @@ def test_a_replay_is_told_how() -> None:
         ("replay", "speed", "fast", "a number"),
         ("replay", "loop", "yes", "true or false"),
         ("demo", "size", "2048.0", "a whole number"),
-        ("live", "rate", "", "a number"),
+        ("live", "rate", "fast", "a number"),
         ("calibrate", "seed", "x", "a whole number"),
     ],
 )
@@ -260,12 +265,81 @@ def test_live_one_body_is_tracked() -> None:
     def tracking(**values: str) -> list[bool]:
         table = SYSTEMS["live"].table({"calibration": "c.yaml", **values})
         chosen = [node for node in table if node.executable in ("localizer", "pipeline")]
-        return [node.parameters.get("tracking.enabled", False) for node in chosen]
+        return [expected(node, "tracking.enabled", "") or False for node in chosen]
 
     assert tracking() == tracking(arrangement="pipeline") == [True]
     assert tracking(tracking="false") == [False]
     with pytest.raises(InputError, match="argument tracking"):
         tracking(tracking="perhaps")
+
+
+def taken(table: list[NodeSpec], config: Path) -> dict[str, dict[str, Any]]:
+    """What nodes take from their command lines, by executable."""
+    found = {}
+    for spec in table:
+        context = Context()
+        rclpy.init(args=command(spec, config=str(config))[3:], context=context)
+        node = Node(spec.executable, context=context, automatically_declare_parameters_from_overrides=True)
+        found[spec.executable] = {name: node.get_parameter(name).value for name in node._parameters}
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    return found
+
+
+def test_a_parameter_file_wins_over_defaults_and_an_argument_over_both(tmp_path: Path) -> None:
+    def write(name: str, **values: Any) -> None:
+        text = yaml.safe_dump({"/**": {"ros__parameters": values}})
+        (tmp_path / f"{name}.yaml").write_text(text)
+
+    def live(**arguments: str) -> dict[str, dict[str, Any]]:
+        given = {"calibration": "c.yaml", "output": "out", "config": str(tmp_path), **arguments}
+        return taken(SYSTEMS["live"].table(given), tmp_path)
+
+    for name in ("frame_source", "localizer", "pose_estimator", "recorder"):
+        write(name, autostart=True)
+    by_default = live()
+    assert (
+        by_default["frame_source"].items() >= {"source": "simulator", "rate": 10.0, "pacing": "rate"}.items()
+    )
+    assert (
+        by_default["localizer"].items() >= {"queue_policy": "drop_oldest", "tracking.enabled": True}.items()
+    )
+    assert by_default["recorder"]["topics"] == list(DEFAULT_TOPICS)
+
+    write("frame_source", source="basler", rate=90.0)
+    write("localizer", queue_policy="block", tracking={"enabled": False})
+    write("recorder", topics=["pose_6dof", "image_raw"], compression="zstd")
+    by_file = live()
+    assert by_file["frame_source"].items() >= {"source": "basler", "rate": 90.0}.items()
+    assert by_file["localizer"].items() >= {"queue_policy": "block", "tracking.enabled": False}.items()
+    assert by_file["pose_estimator"]["queue_policy"] == "drop_oldest"
+    assert (
+        by_file["recorder"].items() >= {"topics": ["pose_6dof", "image_raw"], "compression": "zstd"}.items()
+    )
+    # Nobody waits for what is not recorded.
+    assert by_file["pose_estimator"]["wait_for_subscribers"] == ["pose_6dof:recorder"]
+    assert "image_raw:recorder" in by_file["frame_source"]["wait_for_subscribers"]
+
+    told = live(source="images", rate="10.0", tracking="true")
+    assert told["frame_source"].items() >= {"source": "images", "rate": 10.0}.items()
+    assert told["localizer"]["tracking.enabled"]
+
+    calibrating = SYSTEMS["calibrate"].table({"config": str(tmp_path)})
+    write("calibrator", autostart=True)
+    assert taken(calibrating, tmp_path)["frame_source"].items() >= {"source": "basler", "rate": 90.0}.items()
+    assert not calibrating[1].parameters  # the noise of another camera
+
+
+def test_images_are_recorded_where_it_is_told(tmp_path: Path) -> None:
+    def topics(**arguments: str) -> list[str]:
+        table = SYSTEMS["demo"].table({"calibration": "c.yaml", "output": "out", **arguments})
+        assert ("image_raw:recorder" in table[0].parameters["wait_for_subscribers"]) == bool(arguments)
+        return expected(table[-1], "topics", arguments.get("config", ""))
+
+    assert topics() == list(DEFAULT_TOPICS)
+    assert topics(record_images="true") == [*DEFAULT_TOPICS, "image_raw"]
+    (tmp_path / "recorder.yaml").write_text("recorder: {ros__parameters: {topics: [image_raw, pose]}}")
+    assert topics(record_images="true", config=str(tmp_path)) == ["image_raw", "pose"]
 
 
 def test_calibrating_needs_no_localizer() -> None:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +221,7 @@ def _simulated(seed: int) -> dict[str, Any]:
 def _with(node: NodeSpec, executable: str, **parameters: Any) -> NodeSpec:
     if node.executable != executable:
         return node
-    return NodeSpec(executable, {**node.parameters, **parameters}, node.remappings, node.ends_system)
+    return replace(node, parameters={**node.parameters, **parameters})
 
 
 def _valid(name: str, bag: Path) -> Iterator[Figure]:

@@ -12,6 +12,7 @@ import contextlib
 import datetime
 import functools
 import importlib
+import math
 import os
 import shutil
 import sys
@@ -70,6 +71,8 @@ _IMAGES = QoSProfile(depth=3 * transport.FRAMES.depth)
 #: flushed: of those that come, the first in this order.
 _CYCLE_TYPES = ("mems6dof_msgs/msg/Pose6DOF", "mems6dof_msgs/msg/Localizations", "sensor_msgs/msg/Image")
 _FLUSH_PERIOD = 1.0  # s after which it is flushed without one
+_RATE_OVER = 30  # s over which the rate of the record is taken
+_WARN_BEFORE = 30.0  # min until the disk is full
 _QUIET = 0.1  # s without a message after which nothing is expected any more
 _LATCHED = 10  # messages of a transient-local topic that stand at the beginning of every file
 _MEBIBYTE = 2**20
@@ -142,6 +145,9 @@ class RecorderNode(InstrumentNode):
         self._cycle_types: tuple[str, ...] = _CYCLE_TYPES  # that still count
         self._flushed = 0.0
         self._sequences: dict[str, int] = {}
+        self._written: deque[int] = deque(maxlen=_RATE_OVER + 1)  # bytes, second by second
+        self._minutes_left = math.inf  # until the disk is full
+        self.health.watch("disk", self._disk_concern)
         self.create_service(Trigger, "~/start", self._on_start)
         # In groups of their own: they wait for messages that come meanwhile.
         for name, act in (("stop", self._on_stop), ("split", self._on_split)):
@@ -157,7 +163,7 @@ class RecorderNode(InstrumentNode):
         self._reader = ParameterReader(self)
         if not self.values["start_paused"]:
             self._open()
-        self._dropped = self._bytes = 0
+        self._dropped = 0
         capacity = self.values["queue_mebibytes"] * _MEBIBYTE
         self.start_worker(lambda act: act(), capacity)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -333,11 +339,19 @@ class RecorderNode(InstrumentNode):
         with contextlib.suppress(OSError):  # it is gone, as the worker will find
             free = shutil.disk_usage(bag.path).free // _MEBIBYTE - self.values["minimum_free_mebibytes"]
             self.health.set("disk, MiB left to record", free)
-            before, self._bytes = self._bytes, self.health.total("bytes")
-            if self._bytes > before:
-                minutes = free * _MEBIBYTE / (self._bytes - before) / 60.0
-                self.health.set("disk, min until it is full", round(minutes))
+            self._written.append(self.health.total("bytes"))
+            if (grown := self._written[-1] - self._written[0]) > 0:
+                rate = grown / (len(self._written) - 1)
+                self._minutes_left = free * _MEBIBYTE / rate / 60.0
+                self.health.set("disk, min until it is full", round(self._minutes_left))
+            else:
+                self._minutes_left = math.inf
         self.health.set("file", bag.file)
+
+    def _disk_concern(self) -> str:
+        if self._bag is None or self._minutes_left > _WARN_BEFORE:
+            return ""
+        return f"the disk will be full in {max(self._minutes_left, 0.0):.0f} min"
 
     def _next_path(self) -> str:
         """Where to record: ``output``, or beside it where this node has recorded there, one before it in the
@@ -380,6 +394,8 @@ class RecorderNode(InstrumentNode):
             raise InputError(path, error.strerror or str(error), "a directory to record to") from None
         self._bags += 1
         self._sequences.clear()
+        self._written.clear()
+        self._minutes_left = math.inf
         self._reader.forget()
         self._cycle_types = _CYCLE_TYPES
         self.health.failure = ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shutil
 import subprocess
 import threading
 import time
@@ -94,6 +95,41 @@ def test_without_room_it_does_not_begin(start: Start, tmp_path: Path) -> None:
     assert node.wait() == 1
     (line,) = [line for line in node.lines if "error" in line]
     assert re.search(r"bag: found \d+ MiB left on its disk; expected 1000000000 MiB", line)
+
+
+def test_a_disk_that_fills_up_is_told_in_time(start: Start, peer: Peer, tmp_path: Path) -> None:
+    """2 GiB are left, for years without traffic, for a quarter of an hour at 2 MB/s."""
+    (tmp_path / "bag").mkdir()
+    kept = (shutil.disk_usage(tmp_path).free >> 20) - 2048
+    if kept < 0:
+        pytest.skip("no disk with 2 GiB")
+    arguments = [f"output:={tmp_path / 'bag'}", f"minimum_free_mebibytes:={kept}", "topics:=[pose_6dof]"]
+    node = start("recorder", *parameters(*arguments))
+    found: list[tuple[bytes, str]] = []
+
+    def note(message: DiagnosticArray) -> None:
+        found.extend((status.level, status.message) for status in message.status)
+
+    peer.listen(DiagnosticArray, "/diagnostics", note)
+    poses = peer.publisher(Pose6DOF, "pose_6dof")
+    peer.wait(lambda: [level for level, text in found if "recording" in text][2:])
+    assert {level for level, text in found if "recording" in text} == {DiagnosticStatus.OK}
+    ending = threading.Event()
+
+    def publish() -> None:
+        while not ending.wait(0.01):
+            poses.publish(Pose6DOF(reason="x" * 20_000))
+
+    traffic = threading.Thread(target=publish)
+    traffic.start()
+    try:
+        peer.wait(lambda: any("the disk will be full in" in text for _, text in found))
+    finally:
+        ending.set()
+        traffic.join()
+    levels = {level for level, text in found if "the disk will be full in" in text}
+    assert levels == {DiagnosticStatus.WARN}
+    assert node.stop() == 0
 
 
 @pytest.fixture

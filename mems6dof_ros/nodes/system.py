@@ -92,13 +92,15 @@ def parameter_file(node: NodeSpec, config: str) -> Path:
 
 
 def expected(node: NodeSpec, name: str, config: str) -> Any:
-    """The value that a parameter will have, as far as the table and the parameter file tell."""
+    """The value that a parameter (without a dot in its name) will have, as far as the table and the parameter
+    file tell; None: they do not."""
     if name in node.parameters:
         return node.parameters[name]
     value = None
     if config:
-        # A file that cannot be read is refused by the node.
-        with contextlib.suppress(OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError):
+        # A file that cannot be read, or is none of parameters, is refused by the node.
+        unusable = OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError, KeyError, TypeError
+        with contextlib.suppress(*unusable):
             document = yaml.safe_load(parameter_file(node, config).read_text(encoding="utf-8"))
             for of_node in document.values():
                 value = of_node["ros__parameters"].get(name, value)

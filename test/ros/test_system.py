@@ -340,6 +340,15 @@ def test_images_are_recorded_where_it_is_told(tmp_path: Path) -> None:
     assert topics(record_images="true") == [*DEFAULT_TOPICS, "image_raw"]
     (tmp_path / "recorder.yaml").write_text("recorder: {ros__parameters: {topics: [image_raw, pose]}}")
     assert topics(record_images="true", config=str(tmp_path)) == ["image_raw", "pose"]
+    for nonsense in (
+        "topics",
+        "recorder: 1",
+        "recorder: {topics: [pose]}",
+        "- pose",
+        "{",
+    ):  # the recorder refuses it
+        (tmp_path / "recorder.yaml").write_text(nonsense)
+        assert topics(record_images="true", config=str(tmp_path)) == [*DEFAULT_TOPICS, "image_raw"]
 
 
 def test_calibrating_needs_no_localizer() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from mems6dof_ros import __version__
 from mems6dof_ros.calibration.checks import (
@@ -42,8 +43,11 @@ from mems6dof_ros.calibration.psf_pupil import Imaging
 from mems6dof_ros.calibration.rho_amp import reference_map
 from mems6dof_ros.errors import InputError
 
-#: A bead whose curve departs from its neighbours' by this many times the usual scatter is left out.
-OUTLIER = 8.0
+#: Probability with which a bead like the others is left out for its mean square departure from them, over the
+#: median bead's. A local aberration is one number that stays through focus, so mean squares follow
+#: chi-square of one degree of freedom: a tighter limit takes the scatter away that is to be claimed.
+OUTLIER_PROBABILITY = 1e-5
+OUTLIER = float(chdtri(1, OUTLIER_PROBABILITY) / chdtri(1, 0.5))
 #: Shapes do not depend on brightness; noise is in the covariance. Tested from 1/10 to 10 times.
 BRIGHTNESS_FACTOR = 30.0
 #: Below this number of beads the scatter between particles is poorly known.

@@ -413,8 +413,8 @@ def real_figures(folder: Path, tell: Tell) -> list[Figure]:
     """Real micrographs (see the README of the data), which have no truth but the stage.
 
     The astigmatic stage did not make the steps that are stated: two methods that share no feature
-    see the same departures in all beads. Against the stage as stated no method can be better than that, unless
-    by a map of z that the other beads show (see stage_scale).
+    see the same departures in all beads. Against the stage as stated no method can be better than that,
+    unless by a map of z that the other beads show (see stage_scale).
     """
     planes = astigmatic_frames(folder)
     stack, methods = astigmatic_stack(planes), ("joint", "psf")

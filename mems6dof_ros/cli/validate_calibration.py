@@ -24,7 +24,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--only", choices=PARTS, action="append", help="this part only; may be repeated (default: all)"
     )
     parser.add_argument(
-        "--seeds", type=int, nargs="+", default=[1, 2, 3], help="optics to measure (default: 1 2 3)"
+        "--seeds", type=int, nargs="+", default=[10, 11, 12], help="optics to measure (default: 10 11 12)"
     )
     parser.add_argument("--real-data", type=Path, help="folder of the real focus stacks")
     add_json_option(parser)

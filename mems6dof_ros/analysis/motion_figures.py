@@ -33,6 +33,8 @@ from mems6dof_ros.pose.cycle_pose import DEGREES_OF_FREEDOM
 Array = NDArray[np.float64]
 
 _PHASE = "twilight_shifted"
+#: Of more places, neither lines between them nor ellipses can be told apart.
+FOLLOWED = 100
 
 
 def paths(cycles: ManyCycles) -> Figure:
@@ -47,9 +49,11 @@ def paths(cycles: ManyCycles) -> Figure:
         sd = np.median(cycles.sd[:, first : first + 2], axis=0)
         axis = axes[0][column]
         points = _cloud(axis, measured, phase)
-        for place in measured:
+        few = len(measured) <= FOLLOWED
+        for place in measured if few else ():
             axis.add_patch(Ellipse(place, *(4 * sd * scale), fill=False, color=GREY, lw=0.5))
-        axis.set_title(f"Path of the {what} (1 sd: {quantity(float(sd.mean()), unit)})")
+        ellipses = "; ellipses: 2 sd" if few else ""
+        axis.set_title(f"Path of the {what} (1 sd: {quantity(float(sd.mean()), unit)}{ellipses})")
         axis.set_xlabel(f"{symbols[0]} ({unit})")
         axis.set_ylabel(f"{symbols[1]} ({unit})")
         if part is None or not with_play:
@@ -86,7 +90,7 @@ def spectra(cycles: ManyCycles) -> Figure | None:
         amplitude = spectrum.amplitude[:, i] * scale
         threshold = spectrum.threshold[i] * scale
         axis.semilogy(spectrum.order, amplitude, color=BLUE, lw=0.8)
-        axis.axhline(threshold, color=GREY, lw=0.9, ls="--", label="white noise: 5 % beyond")
+        axis.axhline(threshold, color=GREY, lw=0.9, ls="--", label="white noise: its largest is beyond in 5 %")
         low = float(np.percentile(amplitude, 2)) / 1.5
         axis.set_ylim(low, 4 * max(float(amplitude.max()), threshold))
         for order, colour in ((1, ORANGE), (LOAD_GEAR_TEETH, GREEN)):
@@ -178,7 +182,9 @@ def relative(motion: RelativeMotion) -> Figure:
         axis = axes[i % 3][i // 3]
         symbol, unit, scale = DISPLAY[name]
         if name == "psi" and math.isfinite(motion.ratio):
-            symbol = f"ψ less ({motion.ratio:.6f}) of the other's"
+            sign = "+" if motion.ratio < 0 else "−"
+            symbol = f"ψ {sign} {abs(motion.ratio):.6f} ψ of {motion.to}"
+            unit, scale = "µrad", 1e6
         value, sd = motion.displacement[:, i] * scale, motion.sd[:, i] * scale
         axis.errorbar(
             cycle,
@@ -211,7 +217,7 @@ def _pair(first: int) -> tuple[tuple[str, str], str, float]:
 
 def _cloud(axis: Axes, places: Array, phase: Array) -> PathCollection:
     """Places in order, coloured by psi; the lines between them only while they can be followed."""
-    if len(places) <= 100:
+    if len(places) <= FOLLOWED:
         axis.plot(*places.T, color="#C9CDD3", lw=0.6, zorder=1)
     axis.set_aspect("equal", "datalim")
     return axis.scatter(places[:, 0], places[:, 1], c=phase, cmap=_PHASE, vmin=0, vmax=360, s=12, zorder=2)

@@ -185,7 +185,9 @@ class _CameraFrames:
         self._frames: queue.Queue[Any] = queue.Queue(maxsize=4)
         self._ours = [
             node.create_subscription(FrameInfo, topics.FRAME_INFO, self._on_info, transport.MESSAGES),
-            node.create_subscription(Image, topics.IMAGE, self._on_image, transport.FRAMES),
+            node.create_subscription(
+                Image, topics.IMAGE, self._on_image, transport.for_images(node, topics.IMAGE)
+            ),
         ]
         self._timer = node.create_timer(0.1, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

@@ -92,7 +92,7 @@ class InstrumentNode(ManagedNode):
         """Finish what is queued; before what else a node does."""
         if self.stream:
             self.stream.ask_to_end()
-        if self.worker and (left := self.worker.end()):
+        if self.worker is not None and (left := self.worker.end()):
             self.health.lost(left, f"{left} messages left in the queue")
         if self.stream:
             self.stream.end()
@@ -117,7 +117,7 @@ class InstrumentNode(ManagedNode):
         ``capacity``."""
         capacity = capacity or self.values["queue_size"]
         self.worker = Worker(work, capacity, self.values["queue_policy"])
-        self.health.gauge("queue", lambda: len(self.worker or ()))
+        self.health.gauge("queue", lambda: 0 if self.worker is None else len(self.worker))
         return self.worker
 
     def make_stream(self, tick: Callable[[], None] = lambda: None) -> Stream:
@@ -134,7 +134,7 @@ class InstrumentNode(ManagedNode):
         return f"active: {self.health.state}" if late else ""
 
     def _queue_concern(self) -> str:
-        fill = self.worker.fill if self.worker else 0.0
+        fill = 0.0 if self.worker is None else self.worker.fill
         return f"the queue is {fill:.0%} full" if fill > _FULL else ""
 
     def when_ready(
@@ -207,7 +207,7 @@ class InstrumentNode(ManagedNode):
 
     def check(self) -> None:
         """Raise what ended a thread of this node; called from the main loop."""
-        failure = self.failure or (self.worker.failure if self.worker else None)
+        failure = self.failure or (None if self.worker is None else self.worker.failure)
         if failure:
             raise failure
 

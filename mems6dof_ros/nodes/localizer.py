@@ -175,14 +175,14 @@ class LocalizerNode(InstrumentNode):
         self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.localizer))
 
     def _subscribe(self) -> None:
+        info_topic = self.resolve_topic_name(topics.FRAME_INFO)
+        self._shared = SharedFrames(ring_path(info_topic, self.context.get_domain_id()))
+        self._shared.attend()
         stream = self.make_stream(self._on_tick)
         if self._output.tracker:
             stream.subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
         stream.subscribe(FrameInfo, topics.FRAME_INFO, self._on_info)
         self._subscribe_to_images()
-        info_topic = self.resolve_topic_name(topics.FRAME_INFO)
-        self._shared = SharedFrames(ring_path(info_topic, self.context.get_domain_id()))
-        self._shared_stamps: deque[int] = deque(maxlen=64)
         self._in_a_row, self._informed_at = 0, -math.inf
         self.health.gauge("images by", lambda: "topic" if self._by_topic else "shared memory")
         stream.begin()
@@ -190,18 +190,24 @@ class LocalizerNode(InstrumentNode):
 
     def _subscribe_to_images(self) -> None:
         assert self.stream is not None
-        self.stream.subscribe(Image, topics.IMAGE, self._on_image, transport.FRAMES, raw=True)
-        self._by_topic = True
+        self._quality = transport.for_images(self, topics.IMAGE)
+        self.stream.subscribe(Image, topics.IMAGE, self._on_image, self._quality, raw=True)
+        self._by_topic, self._looked_at = True, time.monotonic()
+
+    def _look_for_cameras(self) -> None:
+        """Subscribe anew where somebody publishes images who offers less than we ask for."""
+        assert self.stream is not None
+        self._looked_at = time.monotonic()
+        if transport.for_images(self, topics.IMAGE) != self._quality:
+            self.stream.unsubscribe(topics.IMAGE)
+            self._subscribe_to_images()
 
     def _on_info(self, info: FrameInfo) -> None:
         stamp_ns = messages.nanoseconds(info.header.stamp)
-        # No frame overtakes one that is still on its way by the topic.
-        behind = self._by_topic and self._matcher.lacks_last_image
-        self._matcher.add_info(stamp_ns, info)
-        image = None if behind else self._shared.find(info.header, stamp_ns)
-        if image and not self._matcher.has_image(stamp_ns):
-            self._matcher.add_image(stamp_ns, image, time.time_ns())
-            self._shared_stamps.append(stamp_ns)
+        self._shared.attend()
+        image = self._shared.find(info.header, stamp_ns)
+        if image or self._by_topic:
+            self._matcher.add_info(stamp_ns, info, image, time.time_ns())
         self._choose(stamp_ns, image is not None)
         self._forward()
 
@@ -212,7 +218,7 @@ class LocalizerNode(InstrumentNode):
         soon = time.monotonic() - self._informed_at < _SOON
         self._informed_at = time.monotonic()
         self._in_a_row = self._in_a_row + 1 if shared and soon else 0
-        if self._by_topic and self._in_a_row >= _SHARED_IN_A_ROW:
+        if self._by_topic and self._in_a_row >= _SHARED_IN_A_ROW and not self._matcher.lacks_image:
             self.stream.unsubscribe(topics.IMAGE)
             self._by_topic = False
         elif not (self._by_topic or shared or self._shared.overtaken(stamp_ns)):
@@ -220,9 +226,6 @@ class LocalizerNode(InstrumentNode):
 
     def _on_image(self, data: bytes) -> None:
         arrival_ns = time.time_ns()
-        with contextlib.suppress(InputError):
-            if transport.stamp_of(data) in self._shared_stamps:
-                return
         try:
             image = messages.deserialize(data, "sensor_msgs/msg/Image")  # its pixels stay where they are
         except Exception as error:  # whatever a reader of nonsense stumbles over
@@ -239,6 +242,8 @@ class LocalizerNode(InstrumentNode):
         self._shared.attend()
         if not self._by_topic and time.monotonic() - self._informed_at > _SOON:
             self._subscribe_to_images()
+        if self._by_topic and time.monotonic() - self._looked_at > _SOON:
+            self._look_for_cameras()
         self._forward()
 
     def _on_jump_back(self, seconds: float) -> None:
@@ -258,6 +263,8 @@ class LocalizerNode(InstrumentNode):
 
     def _localize(self, arrived: ArrivedFrame) -> None:
         begin_ns = time.time_ns()
+        if isinstance(arrived.image, SharedImage) and not arrived.image.fresh():
+            return  # lost as one that a full queue drops, and counted with the next
         try:
             frame = messages.to_frame(arrived.image, arrived.info)
         except InputError as error:
@@ -348,12 +355,17 @@ def make_localizer(values: Mapping[str, Any]) -> Localizer:
 
 
 def rehearse(localizer: Localizer) -> None:
-    """Localize one particle in the middle of a frame that nobody took."""
+    """Localize what a frame may show, in one that nobody took: a few particles, for arrays of one alone have
+    other types, and dark debris."""
     calibration, camera = localizer.calibration, localizer.camera
     width, height = calibration.image_size if calibration else (256, 256)
     pixel_size = calibration.pixel_size if calibration else 1e-7
-    y, x = np.indices((height, width)) - np.array([height // 2, width // 2])[:, None, None]
-    electrons = 10 + 1000 * np.exp(-(x**2 + y**2) / (2 * 3.0**2))
+    middle = np.array([height // 2, width // 2])[:, None, None]
+    electrons: Any = np.full((height, width), 10.0)
+    for place in ([0, 0], [80, 0], [0, 80], [80, 60]):
+        apart = np.indices((height, width)) - middle - np.array(place)[:, None, None]
+        electrons += 1000 * np.exp(-(apart**2).sum(axis=0) / (2 * 3.0**2))
+    electrons[:20, :20] = 0
     level = np.clip(camera.offset_adu + camera.gain_adu_per_electron * electrons, 0, 65535)
     frame = Frame(level.astype(np.uint16), 0, 0, 0, pixel_size=pixel_size)
     with contextlib.suppress(InputError):  # the first frame will tell

@@ -133,12 +133,17 @@ class SharedImage:
     step: int
     data: NDArray[np.uint8]
     is_bigendian: int
-    _slot: Any
+    _slots: NDArray[np.void]
+    _number: int
     _serial: int
 
     def intact(self) -> bool:
         """Not yet overwritten."""
-        return int(self._slot["serial"]) == self._serial
+        return int(self._slots["serial"][self._number]) == self._serial
+
+    def fresh(self) -> bool:
+        """Not soon to be overwritten: the writer is less than half a round ahead."""
+        return self.intact() and int(self._slots["serial"].max()) - self._serial < SLOTS // 2
 
 
 class SharedFrames:
@@ -175,8 +180,19 @@ class SharedFrames:
         serial, height, width, itemsize = (int(slot[k]) for k in ("serial", "height", "width", "itemsize"))
         data = self._ring.pixels(number, height * width * itemsize).view()
         data.flags.writeable = False
+        if slot["stamp_ns"] != stamp_ns or slot["serial"] != serial or serial == 0:
+            return None  # overwritten while it was read
         return SharedImage(
-            header, height, width, _ENCODINGS[itemsize], width * itemsize, data, _BIG_ENDIAN, slot, serial
+            header,
+            height,
+            width,
+            _ENCODINGS[itemsize],
+            width * itemsize,
+            data,
+            _BIG_ENDIAN,
+            slots,
+            number,
+            serial,
         )
 
     def overtaken(self, stamp_ns: int) -> bool:

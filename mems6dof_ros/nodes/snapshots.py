@@ -32,7 +32,7 @@ class Snapshots:
         wanted = self._wanted()
         if wanted and self._subscription is None:
             self._subscription = self._node.create_subscription(
-                Image, self._topic, self._on_image, transport.FRAMES, raw=True
+                Image, self._topic, self._on_image, transport.for_images(self._node, self._topic), raw=True
             )
         elif not wanted:
             self._cancel()

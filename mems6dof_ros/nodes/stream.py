@@ -72,8 +72,8 @@ class Stream:
         informed: bool = False,
     ) -> None:
         """Call ``act`` with each message, ``raw``: serialized, ``informed``: and with rclpy's dict about it.
-        Of what has arrived together, the topic that was subscribed to first comes first. The node destroys
-        the subscription."""
+        Of what has arrived together, topics take turns, in the order of their subscriptions. The node
+        destroys the subscription."""
         subscription = self._node.create_subscription(
             kind, topic, act, quality, callback_group=self._group, raw=raw
         )
@@ -133,11 +133,15 @@ class Stream:
                     self._ticked = time.monotonic()
 
     def _take(self, subscriptions: list[_Subscribed]) -> None:
-        for subscription, act, informed in subscriptions:
-            while not self._ending:
+        """One message of each topic in turn, until there is none or the tick is due."""
+        while time.monotonic() - self._ticked < self._period:
+            taken = False
+            for subscription, act, informed in subscriptions:
                 found = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if found is None:
-                    break
-                act(*found) if informed else act(found[0])
-                if self._changed:
+                if found is not None:
+                    taken = True
+                    act(*found) if informed else act(found[0])
+                if self._ending or self._changed:
                     return
+            if not taken:
+                return

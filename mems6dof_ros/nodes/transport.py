@@ -14,6 +14,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
@@ -45,6 +46,14 @@ def _reliable(depth: int) -> QoSProfile:
 #: Quality of service of images, and of everything else: reliable, as much kept as the segment holds.
 FRAMES = _reliable(10)
 MESSAGES = _reliable(100)
+
+
+def for_images(node: Node, topic: str) -> QoSProfile:
+    """Of a subscription: FRAMES, or best effort where a camera driver would else send us nothing."""
+    offered = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    if any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for each in offered):
+        return QoSProfile(depth=FRAMES.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+    return FRAMES
 
 
 def use_profile(*, frames: bool) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from peers import SMALL_GEAR, NodeProcess, Peer
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
 from mems6dof_msgs.msg import Localizations
@@ -70,10 +71,12 @@ def test_a_frame_that_is_overwritten_is_known(path: Path) -> None:
     reader.attend()
     ring.write(frame(0))
     image = reader.find(None, 1000)
+    assert image is not None
+    assert image.fresh()
     for number in range(1, SLOTS):
         ring.write(frame(number))
-    assert image is not None
     assert image.intact()
+    assert not image.fresh()
     assert not reader.overtaken(1000)
     ring.write(frame(SLOTS))
     assert not image.intact()
@@ -191,6 +194,19 @@ def test_a_localizer_leaves_the_topic_and_comes_back(
     peer.wait(lambda: sum(message.header.stamp.sec > last + 5 for message in found) == 4)
     assert localizer.stop() == 0
     ring_path("/frame_info", domain, FOLDER).unlink()  # of the source that was killed
+
+
+def test_a_camera_driver_that_promises_nothing_is_heard(start: Start, peer: Peer, calibration: str) -> None:
+    """Best effort, as sensor data goes by custom, and begun after the localizer."""
+    peer.listen(Localizations, "localizations")
+    localizer = start("localizer", "-p", f"calibration:={calibration}")
+    localizer.wait_for_line("ready")
+    camera = peer.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+    peer.wait(camera.get_subscription_count)
+    for number, shot in enumerate(motion_frames(SimulationSettings(**SMALL_GEAR), 3)):
+        camera.publish(messages.to_rclpy(messages.image(shot)))
+        peer.wait(lambda number=number: len(peer.received["localizations"]) > number)
+    assert localizer.stop() == 0
 
 
 @pytest.mark.parametrize("share", ["true", "false"])

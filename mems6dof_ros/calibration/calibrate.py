@@ -43,9 +43,11 @@ from mems6dof_ros.calibration.psf_pupil import Imaging
 from mems6dof_ros.calibration.rho_amp import reference_map
 from mems6dof_ros.errors import InputError
 
-#: Probability with which a bead like the others is left out for its mean square departure from them, over the
-#: median bead's. A local aberration is one number that stays through focus, so mean squares follow
-#: chi-square of one degree of freedom: a tighter limit takes the scatter away that is to be claimed.
+#: A bead whose place departs from its neighbours' by this many times the usual mean square is left out.
+OUTLIER_SIDEWAYS = 8.0
+#: Probability with which a bead like the others is left out for its shape. A local aberration is one number
+#: that stays through focus, so mean squares over the median one follow chi-square of one degree of freedom: a
+#: tighter limit takes the scatter away that is to be claimed.
 OUTLIER_PROBABILITY = 1e-5
 OUTLIER = float(chdtri(1, OUTLIER_PROBABILITY) / chdtri(1, 0.5))
 #: Shapes do not depend on brightness; noise is in the covariance. Tested from 1/10 to 10 times.
@@ -118,14 +120,14 @@ def calibrate(
         interval = _interval(curves)
         fit = fit_model(curves, reference, interval, settings.orders, settings.rotations, progress)
         departure, feature = _departures(fit)
-        outliers = departure > OUTLIER
+        sideways = feature < GROUPS["lateral"].stop
+        outliers = departure > np.where(sideways, OUTLIER_SIDEWAYS, OUTLIER)
         if not outliers.any() or len(beads) < FEW_BEADS:
             break
         for k in np.flatnonzero(outliers):
             index, bead = beads[k]
             x, y = bead.fits.parameters[bead.in_focus, :2]
-            sideways = FEATURES[feature[k]] in ("dx", "dy")
-            what = "drifts, or moves in another's light" if sideways else "departs from its neighbours"
+            what = "drifts, or moves in another's light" if sideways[k] else "departs from its neighbours"
             rejected.append(Rejection(x, y, f"{what}: {departure[k]:.0f} times the usual scatter", index))
         beads = [bead for bead, out in zip(beads, outliers, strict=True) if not out]
     chosen = [bead for _, bead in beads]
@@ -246,12 +248,15 @@ def _interval(curves: Sequence[BeadCurve]) -> tuple[float, float]:
 
 
 def _departures(fit: ModelFit) -> tuple[Array, NDArray[np.intp]]:
-    """Mean square of each bead's held-out residuals over the median bead's, in the worst feature (b,), and
-    which of FEATURES that is (b,)."""
+    """Mean square of each bead's held-out residuals over the median bead's (b,), in that of FEATURES (b,)
+    where it is worst, against the limits."""
     square = np.array([np.mean(residual**2, axis=0) for residual in fit.residual])
     kept = square[:, : FEATURES.index("rho_amp")]
     ratio = kept / np.maximum(np.median(kept, axis=0), 1e-30)
-    return np.max(ratio, axis=1), np.argmax(ratio, axis=1)
+    limits = np.full(kept.shape[1], OUTLIER)
+    limits[GROUPS["lateral"]] = OUTLIER_SIDEWAYS
+    worst = np.argmax(ratio / limits, axis=1)
+    return ratio[np.arange(len(ratio)), worst], worst
 
 
 def _valid_range(

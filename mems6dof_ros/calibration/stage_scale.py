@@ -53,12 +53,15 @@ class StageScale:
 
     def remaining(self, scan: BeadScan) -> Array:
         """What the scale leaves of the bead's error in the planes judged, about its mean (n,) m."""
+        if not scan.judged.any():
+            return np.empty(0)
         left = (scan.error - self.design(scan.seen) @ self.coefficients)[scan.judged]
         return np.asarray(left - np.mean(left))
 
 
 def stage_scale(scans: Sequence[BeadScan], step: float) -> StageScale:
-    """The scale that two or more ``scans`` of one stage of ``step`` m have in common."""
+    """The scale that two or more ``scans`` with planes judged, of one stage of ``step`` m, have in common."""
+    scans = [scan for scan in scans if scan.judged.any()]
     seen = np.concatenate([scan.seen for scan in scans])
     count = int(np.ceil(np.ptp(seen) / step)) + _DEGREE
     flat = StageScale(float(seen.min()), step, np.zeros(count))

@@ -90,7 +90,7 @@ def spectra(cycles: ManyCycles) -> Figure | None:
         amplitude = spectrum.amplitude[:, i] * scale
         threshold = spectrum.threshold[i] * scale
         axis.semilogy(spectrum.order, amplitude, color=BLUE, lw=0.8)
-        axis.axhline(threshold, color=GREY, lw=0.9, ls="--", label="white noise: its largest is beyond in 5 %")
+        axis.axhline(threshold, color=GREY, lw=0.9, ls="--", label="white noise: largest beyond in 5 %")
         low = float(np.percentile(amplitude, 2)) / 1.5
         axis.set_ylim(low, 4 * max(float(amplitude.max()), threshold))
         for order, colour in ((1, ORANGE), (LOAD_GEAR_TEETH, GREEN)):

@@ -7,6 +7,7 @@ import os
 import time
 from pathlib import Path
 
+from diagnostic_msgs.msg import DiagnosticArray
 from peers import PATIENCE, Peer, alive, wait_until
 from std_srvs.srv import Trigger
 
@@ -67,10 +68,16 @@ def test_a_recorder_that_is_started_again_goes_on_beside_a_complete_bag(peer: Pe
     def recording() -> int:
         return lines.count("[recorder] INFO recording")
 
+    peer.listen(DiagnosticArray, "/diagnostics")
     with run_system([recorder], on_line=lines.append) as system:
         for number in (1, 2):
             wait_until(lambda number=number: recording() == number)
-            assert peer.call(Trigger, "recorder/stop").success
+            seen = len(peer.received["/diagnostics"])
+            peer.wait(lambda seen=seen: len(peer.received["/diagnostics"]) > seen)  # this one is discovered
+            peer.call(
+                Trigger, "recorder/stop"
+            )  # a second call, where the answer to the first got lost, is refused
+            wait_until(lambda number=number: lines.count("[recorder] INFO stopped") == number)
             system.processes["recorder"].kill()
         wait_until(lambda: recording() == 3)
         assert system.respawned == {"recorder": 2}

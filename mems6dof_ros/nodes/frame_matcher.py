@@ -64,20 +64,28 @@ class FrameMatcher:
         self._told.append(frame)
         self._last_info_ns, self._ticks_at_info = stamp_ns, self._ticks
 
+    def passes_by(self, stamp_ns: int) -> bool:
+        """An image arrives by the topic; True: it is known from memory, and tells but what was lost."""
+        self._give_up_before(stamp_ns)
+        return stamp_ns in self._from_memory
+
     def add_image(self, stamp_ns: int, image: Any, arrival_ns: int) -> None:
         """An image has arrived by the topic at ``arrival_ns``."""
-        awaited = next((f for f in self._told if f.stamp_ns == stamp_ns and f.image is None), None)
-        for frame in self._told:
-            if frame is awaited:
-                break
-            frame.alone |= awaited is not None or frame.stamp_ns < stamp_ns
-        if stamp_ns in self._from_memory:
-            return
+        awaited = self._give_up_before(stamp_ns)
         if awaited is None:
             alone = stamp_ns <= self._last_info_ns
             self._early.append(_Frame(stamp_ns, self._ticks, None, image, arrival_ns, alone))
         else:
             awaited.image, awaited.arrival_ns = image, arrival_ns
+
+    def _give_up_before(self, stamp_ns: int) -> _Frame | None:
+        """Frames that lack their image when a later one has come; returns the one that waits for this."""
+        awaited = next((f for f in self._told if f.stamp_ns == stamp_ns and f.image is None), None)
+        for frame in self._told:
+            if frame is awaited:
+                break
+            frame.alone |= awaited is not None or frame.stamp_ns < stamp_ns
+        return awaited
 
     @property
     def lacks_image(self) -> bool:

@@ -20,6 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
 from mems6dof_msgs.msg import FrameInfo, Pose6DOF
@@ -39,7 +40,7 @@ from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, Instrume
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
 from mems6dof_ros.nodes.frame_order import Arrival, FrameOrder
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
-from mems6dof_ros.nodes.shared_frames import SharedFrames, SharedImage, ring_path
+from mems6dof_ros.nodes.shared_frames import SLOTS, SharedFrames, SharedImage, ring_path
 from mems6dof_ros.nodes.sim_time import on_jump_back
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
@@ -170,9 +171,14 @@ class LocalizerNode(InstrumentNode):
         self._matcher = FrameMatcher()
         self._poses: deque[CyclePose] = deque(maxlen=16)
         self._dropped = 0
+        self._written_meanwhile = 0  # shared frames, while the last was localized
         self.start_worker(self._localize)
         missing = self.missing_subscribers({topics.LOCALIZATIONS: self._output.publisher})
-        self.when_ready(missing, self._subscribe, lambda: rehearse(self._output.localizer))
+        self.when_ready(missing, self._subscribe, self._rehearse)
+
+    def _rehearse(self) -> None:
+        rehearse(self._output.localizer)
+        messages.deserialize(serialize_message(Image()), "sensor_msgs/msg/Image")  # the first takes 0.1 s
 
     def _subscribe(self) -> None:
         info_topic = self.resolve_topic_name(topics.FRAME_INFO)
@@ -226,6 +232,9 @@ class LocalizerNode(InstrumentNode):
 
     def _on_image(self, data: bytes) -> None:
         arrival_ns = time.time_ns()
+        with contextlib.suppress(InputError):
+            if self._matcher.passes_by(transport.stamp_of(data)):
+                return
         try:
             image = messages.deserialize(data, "sensor_msgs/msg/Image")  # its pixels stay where they are
         except Exception as error:  # whatever a reader of nonsense stumbles over
@@ -263,8 +272,10 @@ class LocalizerNode(InstrumentNode):
 
     def _localize(self, arrived: ArrivedFrame) -> None:
         begin_ns = time.time_ns()
-        if isinstance(arrived.image, SharedImage) and not arrived.image.fresh():
-            return  # lost as one that a full queue drops, and counted with the next
+        shared = arrived.image if isinstance(arrived.image, SharedImage) else None
+        behind = shared.written_since() if shared else 0
+        if behind + self._written_meanwhile >= SLOTS:
+            return  # would be overwritten before it is localized: as lost as from a full queue
         try:
             frame = messages.to_frame(arrived.image, arrived.info)
         except InputError as error:
@@ -283,7 +294,9 @@ class LocalizerNode(InstrumentNode):
                 found = self._output.localize(replace(frame, frame_counter=counter, cycle=cycle))
             except InputError as error:
                 self.health.refused(str(error))
-        if isinstance(arrived.image, SharedImage) and not arrived.image.intact():
+        if shared:
+            self._written_meanwhile = min(shared.written_since() - behind, SLOTS // 2)
+        if shared and not shared.intact():
             self.health.lost(1, f"frame {counter} was overwritten while it waited or was localized")
             found = None
         if found is None:

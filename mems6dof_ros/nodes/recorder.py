@@ -65,7 +65,7 @@ KNOWN_TYPES = {
 DEFAULT_TOPICS = tuple(name for name in KNOWN_TYPES if name != topics.IMAGE)
 
 #: More than their publisher keeps: what it takes for acknowledged waits here until it is taken.
-_IMAGES = QoSProfile(depth=3 * transport.FRAMES.depth)
+_IMAGES_KEPT, _IMAGE = 3 * transport.FRAMES.depth, KNOWN_TYPES[topics.IMAGE]
 
 #: A message of one of these types completes a motion cycle, upon which what has been recorded so far is
 #: flushed: of those that come, the first in this order.
@@ -195,11 +195,9 @@ class RecorderNode(InstrumentNode):
     # Topics -------------------------------------------------------------------------------------
 
     def _subscribe_known(self, name: str) -> bool:
-        if name not in KNOWN_TYPES:
+        if name not in KNOWN_TYPES or KNOWN_TYPES[name] == _IMAGE:  # which cameras publish in their own ways
             return False
-        self._subscribe(
-            name, KNOWN_TYPES[name], _IMAGES if "Image" in KNOWN_TYPES[name] else transport.MESSAGES
-        )
+        self._subscribe(name, KNOWN_TYPES[name], transport.MESSAGES)
         return True
 
     def _look_for_types(self) -> None:
@@ -211,12 +209,15 @@ class RecorderNode(InstrumentNode):
             resolved = self.resolve_topic_name(name)
             if resolved not in types:
                 continue
-            self._unknown.remove(name)
             offered = [info.qos_profile for info in self.get_publishers_info_by_topic(resolved)]
-            qos = QoSProfile(depth=transport.MESSAGES.depth)  # by the wire nobody learns the publishers'
+            if not offered:
+                continue
+            self._unknown.remove(name)
+            depth = _IMAGES_KEPT if types[resolved][0] == _IMAGE else transport.MESSAGES.depth
+            qos = QoSProfile(depth=depth)  # by the wire nobody learns the publishers'
             if any(profile.reliability == ReliabilityPolicy.BEST_EFFORT for profile in offered):
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
-            if offered and all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered):
+            if all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered):
                 qos.durability, qos.depth = DurabilityPolicy.TRANSIENT_LOCAL, _LATCHED
             try:
                 self._subscribe(name, types[resolved][0], qos)

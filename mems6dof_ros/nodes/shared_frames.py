@@ -141,9 +141,9 @@ class SharedImage:
         """Not yet overwritten."""
         return int(self._slots["serial"][self._number]) == self._serial
 
-    def fresh(self) -> bool:
-        """Not soon to be overwritten: the writer is less than half a round ahead."""
-        return self.intact() and int(self._slots["serial"].max()) - self._serial < SLOTS // 2
+    def written_since(self) -> int:
+        """Frames that were written after it: upon SLOTS it is overwritten."""
+        return int(self._slots["serial"].max()) - self._serial
 
 
 class SharedFrames:

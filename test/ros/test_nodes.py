@@ -109,7 +109,7 @@ def test_signals_end_every_node_in_good_order(
     start: Start, calibration: str, tmp_path: Path, number: int
 ) -> None:
     nodes = {
-        "waiting for subscribers": start("frame_source"),
+        "active": start("frame_source"),
         "ready": start("pose_estimator"),
         "recording": start("recorder", *parameters(f"output:={tmp_path / 'bag'}")),
         "localizer]: ready": start("localizer", *parameters(f"calibration:={calibration}")),

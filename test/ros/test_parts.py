@@ -187,6 +187,7 @@ def test_images_from_memory_and_by_the_topic_keep_the_order_of_the_infos() -> No
     matcher.add_info(0, 0, "memory", 0)
     taken = matcher.take(True)
     for stamp in range(5, 15):
+        assert not matcher.passes_by(stamp)
         matcher.add_image(stamp, "topic", 0)
     for stamp in range(1, 15):
         matcher.add_info(stamp, stamp, "memory" if stamp < 8 else None, 0)
@@ -203,7 +204,7 @@ def test_what_is_lost_on_the_topic_holds_up_nobody() -> None:
         matcher.add_info(stamp, stamp, "memory" if stamp in (2, 3) else None, 0)
     assert matcher.take(True) == []
     assert matcher.lacks_image
-    matcher.add_image(2, "topic", 0)  # which 1 would have come before
+    assert matcher.passes_by(2)  # which 1 would have come before
     assert [frame.info for frame in matcher.take(True)] == [2, 3]
     matcher.tick()
     matcher.tick()

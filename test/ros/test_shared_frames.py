@@ -72,11 +72,11 @@ def test_a_frame_that_is_overwritten_is_known(path: Path) -> None:
     ring.write(frame(0))
     image = reader.find(None, 1000)
     assert image is not None
-    assert image.fresh()
+    assert image.written_since() == 0
     for number in range(1, SLOTS):
         ring.write(frame(number))
     assert image.intact()
-    assert not image.fresh()
+    assert image.written_since() == SLOTS - 1
     assert not reader.overtaken(1000)
     ring.write(frame(SLOTS))
     assert not image.intact()

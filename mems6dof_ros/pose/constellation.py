@@ -10,6 +10,7 @@ the six directions that no observation can fix (the gauge) free of false informa
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from mems6dof_ros.pose.field import FieldError
-from mems6dof_ros.pose.rigid import IDENTITY, RigidPose, rotation_z
+from mems6dof_ros.pose.rigid import RigidPose, exp_so3, hat, rotation_z
 from mems6dof_ros.pose.solve import pose_jacobian, weights
 
 Array = NDArray[np.float64]
@@ -79,10 +80,8 @@ class Constellation:
         self._vector = np.zeros(len(modes))
         self._eliminated: list[Array] = []  # of every cycle since: what its pose took, see observe
         self._refined_at = 0
-        self._latest = IDENTITY
-        self._centre: Array | None = None
         self._joint = np.empty((0, 0))  # covariance of all positions, given the field error
-        self._frames = np.zeros((2, 6, len(modes)))
+        self._frames = np.zeros((12, len(modes)))  # see define_frames
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -161,17 +160,15 @@ class Constellation:
             )
         )  # fmt: skip
         self.cycles += 1
-        self._latest = pose
 
     def relative(self, rows: Indices, pose: RigidPose, noise: Array, has_z: Mask, modes: Array) -> Relative:
         """What is uncertain of ``rows`` (n,) against each other, at ``pose``; ``noise`` (n, 3, 3) m^2 of
         their localizations, whose z counts where ``has_z`` (n,); ``modes`` (n, 3, k) of the field there.
 
         How the field error moves them is the directly seen ``modes``, less what the map has absorbed of them,
-        less what is no error of the motion but a constant of the frames (see ``_constant_response``).
+        less what is no error of the motion but a constant of the frames (see ``define_frames``).
         """
-        microscope, body = self._frames
-        constant = microscope + (pose.rotation @ body.reshape(2, 3, -1)).reshape(6, -1)
+        constant = self.constant(pose)
         joint = _blocks(self._joint, rows)
         # They only say which motion counts as common: that x and y are not turned does not matter.
         weight = weights(noise + self.covariance[rows], has_z)
@@ -187,6 +184,18 @@ class Constellation:
             joint,
         )
         return Relative(response, spread, covariance, joint)
+
+    def constant(self, pose: RigidPose) -> Array:
+        """How the coefficients of the field error move ``pose`` by moving the frames, (6, k)."""
+        return np.asarray(_motion_of_frames(*pose) @ self._frames)
+
+    def correction(self, pose: RigidPose, position: Array, modes: Array) -> Array:
+        """The field error (n, 3) m as known now at ``position`` (n, 3) m, where its ``modes`` (n, 3, k) are,
+        for a body at ``pose``; less how it moves the frames, which must not move with what is learnt."""
+        motion = self.constant(pose) @ self.field_mean
+        return np.asarray(
+            modes @ self.field_mean - motion[:3] - (position - pose.translation) @ hat(motion[3:]).T
+        )
 
     def linearisation(self, rows: Indices) -> Array:
         """Fixed positions (n, 3) m that ``observe`` refers to."""
@@ -223,16 +232,11 @@ class Constellation:
         """True when enough evidence has come in to make ``refine`` worth its time."""
         return self.cycles - self._refined_at >= min(REFINE_AT_MOST, max(1, self.cycles // 8))
 
-    def refine(self, centre: Array | None = None) -> None:
-        """Solve for all positions and the field error: milliseconds, hence not in every cycle.
-
-        ``centre`` (2,) m: about which the body turns, in the microscope frame; None where that is not known
-        better than before. Where covariances contradict each other beyond what numbers can hold, the map
-        stays as it is.
+    def refine(self) -> None:
+        """Solve for all positions and the field error: milliseconds, hence not in every cycle. Where
+        covariances contradict each other beyond what numbers can hold, the map stays as it is.
         """
         self._refined_at = self.cycles
-        if centre is not None:
-            self._centre = centre
         self._settle()
         self._forget_retired()
         with suppress(np.linalg.LinAlgError):
@@ -268,33 +272,48 @@ class Constellation:
         for a in range(3):
             for b in range(3):
                 self.covariance[:, a, b] = self._joint[first + a, first + b]
-        self._frames = self._constant_response()
 
-    def _constant_response(self) -> Array:
-        """What the field error does to all poses of a revolution alike, (2, 6, k): a constant motion of
-        the microscope frame and one of the body frame, by least squares.
+    def define_frames(self, pose: RigidPose, centre: Array) -> Callable[[RigidPose], RigidPose]:
+        """Take what the field error does to all poses of a revolution alike for constants of the frames: a
+        motion of the microscope frame and one of the body frame. The revolution is that of ``pose`` about
+        ``centre`` (2,) m, in the microscope frame. Returns what takes a pose of the frames before to these.
 
-        No rotating body can measure either, both are definitions, and neither may enter the covariance:
-        an unknown constant is not an error of motion. The revolution is about the middle of the field,
-        which is right for a body that fills it and on the safe side for a smaller one. Of a body whose centre
-        is out of the field (a ring gear) only an arc is seen, over which no constant is told from a drift:
-        none is taken off.
+        No rotating body can measure either, both are definitions, and neither may enter the covariance: an
+        unknown constant is not an error of motion. Any constants would do, but they have to stay: frames
+        that follow what is learnt of the field error move, and no covariance says so.
         """
-        constants = np.zeros((2, 6, len(self.modes)))
-        if self._centre is not None and (np.abs(self._centre) > self.modes.half_size).any():
+        before = self._frames
+        self._frames = self._constants(pose, centre)
+        change = (self._frames - before) @ self.field_mean
+
+        def moved(pose: RigidPose) -> RigidPose:
+            motion = _motion_of_frames(*pose) @ change
+            return RigidPose(exp_so3(motion[3:]) @ pose.rotation, pose.translation + motion[:3])
+
+        return moved
+
+    def _constants(self, pose: RigidPose, centre: Array) -> Array:
+        """Those motions with the coefficients of the field error, (12, k), by least squares. Of a body whose
+        centre is out of the field (a ring gear) only an arc is seen, over which no constant is told from a
+        drift: none is taken."""
+        constants = np.zeros_like(self._frames)
+        if len(self.modes) == 0 or (np.abs(centre) > self.modes.half_size).any():
             return constants
+        axis = np.array([*centre, 0.0])
+        # Rotations count by the shift that they make at the edge of the field.
+        unit = np.r_[np.ones(3), np.full(3, max(self.modes.half_size))]
         around, responses = [], []
         for angle in np.arange(AROUND) * (math.tau / AROUND):
-            pose = self._latest.then(RigidPose(rotation_z(angle), np.zeros(3)))
-            place = pose.apply(self.position)
+            turn = rotation_z(angle)
+            turned = pose.then(RigidPose(turn, axis - turn @ axis))
+            place = turned.apply(self.position)
             seen = np.flatnonzero((np.abs(place[:, :2]) < self.modes.half_size).all(axis=1))
             if len(seen) >= 8:
-                around.append(np.c_[np.eye(3), pose.rotation])
-                responses.append(self._response(pose, place, seen))
-        for part in (slice(0, 3), slice(3, 6)) if around else ():
-            stacked = np.concatenate([response[part] for response in responses])
-            solution = np.linalg.lstsq(np.concatenate(around), stacked, rcond=1e-3)[0]
-            constants[0, part], constants[1, part] = solution[:3], solution[3:]
+                around.append(unit[:, None] * _motion_of_frames(*turned) / np.tile(unit, 2))
+                responses.append(unit[:, None] * self._response(turned, place, seen))
+        if around:
+            solution = np.linalg.lstsq(np.concatenate(around), np.concatenate(responses), rcond=1e-3)[0]
+            constants = solution / np.tile(unit, 2)[:, None]
         return constants
 
     def _response(self, pose: RigidPose, place: Array, seen: Indices) -> Array:
@@ -434,6 +453,16 @@ class Candidates:
         """Keep the places where ``mask`` (c,) is True."""
         for name in ("ids", "position", "covariance", "sightings", "misses", "former"):
             setattr(self, name, getattr(self, name)[mask])
+
+
+@njit(cache=True, nogil=True)
+def _motion_of_frames(rotation, translation):  # type: ignore[no-untyped-def]
+    """How a pose moves (6, 12) with small motions of the microscope frame and of the body frame."""
+    out = np.zeros((6, 12))
+    out[:, :6] = np.eye(6)
+    out[:3, 3:6] = -hat(translation)
+    out[:3, 6:9] = out[3:, 9:] = rotation
+    return out
 
 
 @njit(cache=True, nogil=True)

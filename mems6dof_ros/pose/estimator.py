@@ -142,7 +142,8 @@ class PoseEstimator:
         the new reference version. Raises InputError before the first pose."""
         if self._last is None:
             raise InputError("set_reference", "no valid pose yet", "a pose to refer to")
-        self._refer_to(self._last.pose, self._last.psi)
+        self.learn()
+        self._refer_to(self._last)
         return self._frame.version
 
     def snapshot(self) -> ReferenceConstellation:
@@ -212,6 +213,7 @@ class PoseEstimator:
     # ----------------------------------------------------------------------------- tracking
 
     def _track(self, localizations: Localizations, view: Usable, constellation: Constellation) -> CyclePose:
+        self._recentre()
         s, last = self.settings, self._last
         if s.field_size is None:
             self._half_field = np.maximum(self._half_field, np.abs(view.position[:, :2]).max(axis=0))
@@ -233,10 +235,10 @@ class PoseEstimator:
         factor = constellation.noise_factor(rows) * (self._noise[0] / self._noise[1])
         noise = scaled(seen.covariance, factor)
         relative = constellation.relative(rows, start, noise, seen.has_z, modes)
+        field = constellation.correction(start, seen.position, modes)
         solution = solve_pose(
-            start, constellation.position[rows], relative.covariance,
-            seen.position - modes @ constellation.field_mean, noise, seen.has_z, relative.response,
-            relative.spread, s.gate_xy, s.gate_z,
+            start, constellation.position[rows], relative.covariance, seen.position - field, noise,
+            seen.has_z, relative.response, relative.spread, s.gate_xy, s.gate_z,
         )  # fmt: skip
         used, used_z = int((solution.use > UNUSED).sum()), int((solution.use == FULL).sum())
         if not solution.ok or used < s.min_particles:
@@ -277,7 +279,6 @@ class PoseEstimator:
         elif localizations.cycle > last.cycle:
             self._steps.append((psi - last.psi) / (localizations.cycle - last.cycle))
         self.centre.add(state.pose.rotation, state.pose.translation)
-        self._recentre(state)
         self._last = state
         doubt = self._doubt(used, expected, sd_psi)
         return report(
@@ -433,9 +434,7 @@ class PoseEstimator:
                 constellation.covariance[retired], former=True,
             )  # fmt: skip
         if constellation.due:
-            centre = self.centre.estimate()
-            known = centre is not None and centre.sd < CENTRE_KNOWN
-            constellation.refine(centre.microscope if centre and known else None)
+            constellation.refine()
 
     def _learn_noise(self, constellation: Constellation, rows: Indices, solution: Solution) -> None:
         """Compare the residuals with what the covariances claim, over all particles and for each."""
@@ -455,7 +454,9 @@ class PoseEstimator:
         none = np.empty(0, np.int64)
         if not len(newcomers.of) and not len(candidates):
             return none, none
-        field = constellation.modes.evaluate(newcomers.position) @ constellation.field_mean
+        field = constellation.correction(
+            pose, newcomers.position, constellation.modes.evaluate(newcomers.position)
+        )
         place = pose.inverse().apply(newcomers.position - field)
         jacobian = pose_jacobian(place, pose.rotation)
         covariance = newcomers.covariance + jacobian @ state.noise @ jacobian.transpose(0, 2, 1)
@@ -504,20 +505,25 @@ class PoseEstimator:
 
     # ---------------------------------------------------------------------------- reference
 
-    def _recentre(self, state: State) -> None:
-        """Move the origin to the centre of rotation at the turns that the settings name."""
-        due, frame = self.settings.recentre_at, self._frame
-        if self._recentred < len(due) and abs(state.psi - frame.psi) >= due[self._recentred]:
+    def _recentre(self) -> None:
+        """Move the origin to the centre of rotation once the turns that the settings name are reached."""
+        due, frame, last = self.settings.recentre_at, self._frame, self._last
+        if last and self._recentred < len(due) and abs(last.psi - frame.psi) >= due[self._recentred]:
             self._recentred += 1
             pose = RigidPose(frame.rotation, frame.place - frame.rotation @ frame.origin)
-            self._refer_to(pose, frame.psi)
+            self._refer_to(last._replace(pose=pose, psi=frame.psi))
 
-    def _refer_to(self, pose: RigidPose, psi: float) -> None:
-        """New version of the body frame: reference ``pose``, origin at the centre as known now."""
-        origin, centre = self._frame.origin.copy(), self.centre.estimate()
+    def _refer_to(self, reference: State) -> None:
+        """New version of the frames: the pose of ``reference``, origin at the centre as known now."""
+        origin, centre, pose = self._frame.origin.copy(), self.centre.estimate(), reference.pose
         if centre is not None and centre.sd < self.settings.max_displacement:
             origin[:2] = centre.body
-        self._frame = BodyFrame(self._frame.version + 1, pose.rotation, origin, pose.apply(origin), psi)
+            if self._last is not None and self.constellation is not None:
+                moved = self.constellation.define_frames(self._last.pose, centre.microscope)
+                pose, self._last = moved(pose), self._last._replace(pose=moved(self._last.pose))
+        self._frame = BodyFrame(
+            self._frame.version + 1, pose.rotation, origin, pose.apply(origin), reference.psi
+        )
 
     # ------------------------------------------------------------------------------ helpers
 

@@ -79,7 +79,7 @@ class Constellation:
         self._information = np.zeros((len(modes), len(modes)))  # lower triangle; field first, then particles
         self._vector = np.zeros(len(modes))
         self._eliminated: list[Array] = []  # of every cycle since: what its pose took, see observe
-        self._refined_at = 0
+        self._refined_at, self._joined = 0, False  # particles since then
         self._joint = np.empty((0, 0))  # covariance of all positions, given the field error
         self._frames = np.zeros((12, len(modes)))  # see define_frames
 
@@ -126,6 +126,7 @@ class Constellation:
         if n == 0:
             return
         self._settle()
+        self._joined = True
         self.ids = np.r_[self.ids, ids]
         self.active = np.r_[self.active, np.ones(n, bool)]
         self.position = np.r_[self.position, position]
@@ -229,14 +230,16 @@ class Constellation:
 
     @property
     def due(self) -> bool:
-        """True when enough evidence has come in to make ``refine`` worth its time."""
-        return self.cycles - self._refined_at >= min(REFINE_AT_MOST, max(1, self.cycles // 8))
+        """True when enough evidence has come in to make ``refine`` worth its time, or when particles have
+        joined since: they are known by their first sightings only, and others may join from them."""
+        since = self.cycles - self._refined_at
+        return self._joined or since >= min(REFINE_AT_MOST, max(1, self.cycles // 8))
 
     def refine(self) -> None:
         """Solve for all positions and the field error: milliseconds, hence not in every cycle. Where
         covariances contradict each other beyond what numbers can hold, the map stays as it is.
         """
-        self._refined_at = self.cycles
+        self._refined_at, self._joined = self.cycles, False
         self._settle()
         self._forget_retired()
         with suppress(np.linalg.LinAlgError):

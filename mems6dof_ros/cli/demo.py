@@ -11,7 +11,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -158,6 +158,12 @@ def measure(settings: SimulationSettings, cycles: int, calibration: Path, out: P
         watched={topics.POSE_6DOF: "watch"},
         monitor=NodeSpec("monitor", {"port": 0}),
     )
+    # All frames may wait for a disk that is busy, with a fresh installation for instance.
+    room = {"queue_mebibytes": 2048}
+    nodes = [
+        replace(node, parameters={**node.parameters, **room}) if node.executable == "recorder" else node
+        for node in nodes
+    ]
     with log.open("w", encoding="utf-8") as lines, Progress("     cycles") as progress:
 
         def on_pose(pose: CyclePose) -> None:

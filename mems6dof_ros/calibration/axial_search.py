@@ -14,9 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mems6dof_ros.localization.vectors import LANES, load, log, splat, store, where_positive
+
 Array = NDArray[np.float64]
 
 _REFINEMENTS = 8
+_SETTLED = 1e-4  # grid steps, about a hundredth of a nanometre
 _LEAST_VARIANCE = 1e-20
 
 # Sums may be reordered (vectors); NaN keeps its meaning.
@@ -33,17 +36,14 @@ def search_defocus(
     limits: NDArray[np.int64],
     grid: Array,
     basis: Array,
-    slope_basis: Array,
     scatter: Array,
 ) -> tuple[Array, Array, Array]:
     """Best and second-best defocus of n particles from k features.
 
-    ``measured`` (n, k), ``noise`` (n, k, k); ``local`` (n, k, m): coefficients of each particle's curves;
-    ``inflation`` (n, k): of the standard deviations in ``scatter``, for each particle;
-    ``limits`` (n, 2): first and last grid point to consider;
-    ``grid`` (g,) m, equidistant, with ``basis`` and ``slope_basis`` (g, m): the polynomials there and
-    their derivatives per grid step; ``scatter`` (g, k, k). Between grid points basis and scatter are
-    interpolated (cubic Hermite, linear).
+    ``measured`` (n, k), ``noise`` (n, k, k); ``local`` (n, k, m): Chebyshev coefficients of each
+    particle's curves over the whole ``grid`` (g,) m, equidistant, with ``basis`` (g, m), the polynomials
+    there; ``inflation`` (n, k): of the standard deviations in ``scatter`` (g, k, k), which is interpolated
+    linearly, for each particle; ``limits`` (n, 2): first and last grid point to consider.
     Returns defocus (n, 2) m, objective L (n, 2) and chi-square (n, 2); NaN where no second minimum is.
     """
     count, k = measured.shape
@@ -53,67 +53,110 @@ def search_defocus(
     objective = np.full((count, 2), np.nan)
     chi_square = np.full((count, 2), np.nan)
     # Grid points innermost: what is done alike for all of them runs in vectors.
-    scatter_of = np.ascontiguousarray(scatter.transpose(1, 2, 0))
-    basis_of, slope_basis_of = np.ascontiguousarray(basis.T), np.ascontiguousarray(slope_basis.T)
-    curve = np.empty((k, points))
-    slope = np.empty((k, points))
-    level = np.empty(points)
-    residuals, factors = np.empty((k, points)), np.empty((k, k, points))
-    residual = np.empty(k)
-    tangent = np.empty(k)
-    factor = np.empty((k, k))
+    padded = (points + LANES - 1) // LANES * LANES
+    basis_of, scatter_of = np.zeros((basis.shape[1], padded)), np.zeros((k * k, padded))
+    basis_of[:, :points] = basis.T
+    scatter_of[:, :points] = scatter.reshape(points, k * k).T
+    level, spare = np.empty((1, padded)), np.empty((k * k + 3 * k, LANES))
+    room, factor = np.empty((2, k)), np.empty((k, k))
+    coefficients = np.empty((local.shape[2], k))
     for i in range(count):
+        _levels(measured[i], noise[i], local[i], inflation[i], basis_of, scatter_of, spare, level)
         first, last = limits[i]
-        _combine(local[i], basis_of, curve)
-        _combine(local[i], slope_basis_of, slope)
-        for a in range(k):
-            for g in range(points):
-                residuals[a, g] = measured[i, a] - curve[a, g]
-        _levels(noise[i], scatter_of, inflation[i], residuals, factors, level)
-        for g in range(first, last + 1):
-            if (g > first and level[g] >= level[g - 1]) or (g < last and level[g] > level[g + 1]):
+        coefficients[:] = local[i].T
+        for slot, start in enumerate(_two_minima(level[0], first, last)):
+            if start < 0:
                 continue
-            low, high = max(g - 1.0, float(first)), min(g + 1.0, float(last))
-            at = float(g)
-            chi = 0.0
-            log_det = 0.0
-            for iteration in range(_REFINEMENTS + 1):
-                left = min(int(at), last - 1)
-                t = at - left
-                for a in range(k):
-                    y0, y1, d0, d1 = curve[a, left], curve[a, left + 1], slope[a, left], slope[a, left + 1]
-                    c2 = 3 * (y1 - y0) - 2 * d0 - d1
-                    c3 = 2 * (y0 - y1) + d0 + d1
-                    residual[a] = measured[i, a] - (y0 + t * (d0 + t * (c2 + t * c3)))
-                    tangent[a] = d0 + t * (2 * c2 + 3 * t * c3)
-                    for b in range(a + 1):
-                        factor[a, b] = noise[i, a, b] + inflation[i, a] * inflation[i, b] * (
-                            (1 - t) * scatter[left, a, b] + t * scatter[left + 1, a, b]
-                        )
-                log_det = _factorize(factor, k)
-                chi, gain, information = _products(factor, residual, tangent, k)
-                if iteration == _REFINEMENTS or information <= 0:
-                    break
-                moved = min(max(at + gain / information, low), high)
-                if abs(moved - at) < 1e-6:
-                    break
-                at = moved
-            level_here = chi + log_det
-            slot = 2
-            if not level_here >= objective[i, 0]:
-                defocus[i, 1], objective[i, 1], chi_square[i, 1] = (
-                    defocus[i, 0],
-                    objective[i, 0],
-                    chi_square[i, 0],
-                )
+            at, chi, level_here = _refine(
+                start, first, last, measured[i], noise[i], coefficients, inflation[i], scatter, room, factor
+            )
+            if slot == 1 and level_here < objective[i, 0]:
+                for found in (defocus, objective, chi_square):
+                    found[i, 1] = found[i, 0]
                 slot = 0
-            elif not level_here >= objective[i, 1]:
-                slot = 1
-            if slot < 2:
-                defocus[i, slot] = grid[0] + at * step
-                objective[i, slot] = level_here
-                chi_square[i, slot] = chi
+            defocus[i, slot] = grid[0] + at * step
+            objective[i, slot] = level_here
+            chi_square[i, slot] = chi
     return defocus, objective, chi_square
+
+
+@njit(forceinline=True, **_OPTIONS)
+def _two_minima(level: Array, first: int, last: int) -> tuple[float, float]:
+    """Where ``level`` (g,) has its two lowest minima from ``first`` to ``last``, in grid steps, -1 for none:
+    by the parabola through each and its neighbours."""
+    lowest = second = -1.0
+    least = runner_up = np.inf
+    for g in range(first, last + 1):
+        if (g > first and level[g] >= level[g - 1]) or (g < last and level[g] > level[g + 1]):
+            continue
+        at, bottom = float(g), level[g]
+        if first < g < last:
+            rise, bend = level[g + 1] - level[g - 1], level[g + 1] + level[g - 1] - 2 * level[g]
+            at -= rise / (2 * bend)
+            bottom -= rise * rise / (8 * bend)
+        if bottom < least:
+            second, runner_up = lowest, least
+            lowest, least = at, bottom
+        elif bottom < runner_up:
+            second, runner_up = at, bottom
+    return lowest, second
+
+
+@njit(forceinline=True, **_OPTIONS)
+def _refine(
+    start: float,
+    first: int,
+    last: int,
+    measured: Array,
+    noise: Array,
+    coefficients: Array,
+    inflation: Array,
+    scatter: Array,
+    room: Array,
+    factor: Array,
+) -> tuple[float, float, float]:
+    """The minimum near ``start`` by Gauss-Newton: where, in grid steps like it, chi-square there and L.
+
+    ``coefficients`` (m, k) of the curves; ``room`` (2, k) and ``factor`` (k, k) are scratch."""
+    terms, k = coefficients.shape
+    residual, tangent = room[0], room[1]
+    low, high = max(start - 1.0, float(first)), min(start + 1.0, float(last))
+    scale = 2.0 / (len(scatter) - 1)
+    at = start
+    iteration = 0
+    while True:
+        residual[:] = measured
+        tangent[:] = 0.0
+        place = at * scale - 1.0
+        before, here = 1.0, place  # T_0, T_1 and the derivatives
+        slope_before, slope_here = 0.0, scale
+        for m in range(terms):
+            for a in range(k):
+                residual[a] -= coefficients[m, a] * before
+                tangent[a] += coefficients[m, a] * slope_before
+            before, here, slope_before, slope_here = (
+                here,
+                2 * place * here - before,
+                slope_here,
+                2 * (scale * here + place * slope_here) - slope_before,
+            )
+        left = min(int(at), last - 1)
+        t = at - left
+        for a in range(k):
+            for b in range(a + 1):
+                factor[a, b] = noise[a, b] + inflation[a] * inflation[b] * (
+                    (1 - t) * scatter[left, a, b] + t * scatter[left + 1, a, b]
+                )
+        log_det = _factorize(factor, k)
+        chi, gain, information = _products(factor, residual, tangent, k)
+        if iteration == _REFINEMENTS or information <= 0:
+            break
+        moved = min(max(at + gain / information, low), high)
+        if abs(moved - at) < _SETTLED:
+            break
+        at = moved
+        iteration += 1
+    return at, chi, chi + log_det
 
 
 @njit(**_OPTIONS)
@@ -177,12 +220,12 @@ def linearize(
             weighted[a] = slope[used[a]]
             for c in range(a):
                 weighted[a] -= factor[a, c] * weighted[c]
-            weighted[a] /= factor[a, a]
+            weighted[a] *= factor[a, a]
             information += weighted[a] * weighted[a]
         for a in range(k - 1, -1, -1):
             for c in range(a + 1, k):
                 weighted[a] -= factor[c, a] * weighted[c]
-            weighted[a] /= factor[a, a]
+            weighted[a] *= factor[a, a]
         jacobian[:] = 0.0
         for a in range(k):
             gain = weighted[a] / information
@@ -205,76 +248,70 @@ def linearize(
 
 
 @njit(forceinline=True, **_OPTIONS)
-def _combine(coefficients: Array, basis: Array, curves: Array) -> None:
-    """``curves = coefficients @ basis``."""
-    curves[:] = 0.0
-    for a in range(len(curves)):
-        for m in range(len(basis)):
-            c = coefficients[a, m]
-            for g in range(curves.shape[1]):
-                curves[a, g] += c * basis[m, g]
-
-
-@njit(forceinline=True, **_OPTIONS)
 def _levels(
-    noise: Array, scatter: Array, inflation: Array, residuals: Array, factors: Array, levels: Array
+    measured: Array,
+    noise: Array,
+    local: Array,
+    inflation: Array,
+    basis: Array,
+    scatter: Array,
+    spare: Array,
+    level: Array,
 ) -> None:
-    """``levels = r' C^-1 r + ln det C`` for ``C = noise + inflated scatter`` at every grid point.
+    """``level = r' C^-1 r + ln det C`` for ``C = noise + inflated scatter`` at all grid points, (1, g).
 
-    ``residuals`` (k, g), overwritten; ``scatter``, ``factors`` (k, k, g): lower Cholesky factors with their
-    diagonals inverted, since products are faster than divisions.
+    ``basis`` (m, g), ``scatter`` (k k, g): a column for each grid point, padded to whole vectors. C = L D L' by
+    rows, without roots; ``spare`` (k k + 3 k, LANES): L, then of the row at hand L D, 1 / D and L^-1 r.
     """
-    k, points = residuals.shape
-    determinant = np.ones(points)
-    levels[:] = 0.0
-    for a in range(k):
-        diagonal = factors[a, a]
-        factor = inflation[a] * inflation[a]
-        for g in range(points):
-            diagonal[g] = noise[a, a] + factor * scatter[a, a, g]
-        for b in range(a):
-            entry = factors[a, b]
-            factor = inflation[a] * inflation[b]
-            for g in range(points):
-                entry[g] = noise[a, b] + factor * scatter[a, b, g]
-            for c in range(b):
-                for g in range(points):
-                    entry[g] -= factors[a, c, g] * factors[b, c, g]
-            for g in range(points):
-                entry[g] *= factors[b, b, g]
-                diagonal[g] -= entry[g] * entry[g]
-                residuals[a, g] -= entry[g] * residuals[b, g]
-        for g in range(points):
-            variance = max(diagonal[g], _LEAST_VARIANCE)
-            determinant[g] *= variance
-            diagonal[g] = 1 / np.sqrt(variance)
-            residuals[a, g] *= diagonal[g]
-            levels[g] += residuals[a, g] * residuals[a, g]
-    for g in range(points):
-        levels[g] += np.log(determinant[g])
+    k, terms = local.shape
+    product, inverse, whitened = k * k, k * k + k, k * k + 2 * k
+    for j in range(0, level.shape[1], LANES):
+        determinant, squares = splat(1.0), splat(0.0)
+        for a in range(k):
+            residual = splat(measured[a])
+            for m in range(terms):
+                residual -= load(basis, m, j) * local[a, m]
+            variance = load(scatter, a * k + a, j) * (inflation[a] * inflation[a]) + noise[a, a]
+            for b in range(a):
+                entry = load(scatter, a * k + b, j) * (inflation[a] * inflation[b]) + noise[a, b]
+                for c in range(b):
+                    entry -= load(spare, product + c, 0) * load(spare, b * k + c, 0)
+                lower = entry * load(spare, inverse + b, 0)
+                store(spare, product + b, 0, entry)
+                store(spare, a * k + b, 0, lower)
+                variance -= entry * lower
+                residual -= lower * load(spare, whitened + b, 0)
+            variance = where_positive(variance - _LEAST_VARIANCE, variance, splat(_LEAST_VARIANCE))
+            determinant *= variance
+            inverted = 1.0 / variance
+            store(spare, inverse + a, 0, inverted)
+            store(spare, whitened + a, 0, residual)
+            squares += residual * residual * inverted
+        store(level, 0, j, squares + log(determinant))
 
 
 @njit(forceinline=True, **_OPTIONS)
 def _factorize(matrix: Array, k: int) -> float:
-    """Cholesky factor in place (lower triangle); returns ln det."""
-    log_det = 0.0
+    """Cholesky factor in place (lower triangle), its diagonal inverted; returns ln det."""
+    determinant = 1.0
     for a in range(k):
-        for b in range(a + 1):
+        for b in range(a):
             total = matrix[a, b]
             for c in range(b):
                 total -= matrix[a, c] * matrix[b, c]
-            if a == b:
-                total = max(total, _LEAST_VARIANCE)
-                log_det += np.log(total)
-                matrix[a, a] = np.sqrt(total)
-            else:
-                matrix[a, b] = total / matrix[b, b]
-    return log_det
+            matrix[a, b] = total * matrix[b, b]
+        total = matrix[a, a]
+        for c in range(a):
+            total -= matrix[a, c] * matrix[a, c]
+        total = max(total, _LEAST_VARIANCE)
+        determinant *= total
+        matrix[a, a] = 1 / np.sqrt(total)
+    return float(np.log(determinant))
 
 
 @njit(forceinline=True, **_OPTIONS)
 def _products(factor: Array, residual: Array, tangent: Array, k: int) -> tuple[float, float, float]:
-    """r'C^-1 r, t'C^-1 r and t'C^-1 t from the Cholesky factor of C; overwrites r and t."""
+    """r'C^-1 r, t'C^-1 r and t'C^-1 t from ``factor`` of C as in ``_factorize``; overwrites r and t."""
     chi = 0.0
     gain = 0.0
     information = 0.0
@@ -284,8 +321,8 @@ def _products(factor: Array, residual: Array, tangent: Array, k: int) -> tuple[f
         for c in range(a):
             r -= factor[a, c] * residual[c]
             t -= factor[a, c] * tangent[c]
-        residual[a] = r / factor[a, a]
-        tangent[a] = t / factor[a, a]
+        residual[a] = r * factor[a, a]
+        tangent[a] = t * factor[a, a]
         chi += residual[a] * residual[a]
         gain += tangent[a] * residual[a]
         information += tangent[a] * tangent[a]

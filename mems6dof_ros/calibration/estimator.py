@@ -128,7 +128,6 @@ class Estimator:
             limits,
             self._grid,
             self._basis,
-            self._slope_basis,
             self._scatter,
         )
         return _Search(measured, noise, local, inflation, limits, defocus, objective, chi_square)

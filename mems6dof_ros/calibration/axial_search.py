@@ -260,8 +260,9 @@ def _levels(
 ) -> None:
     """``level = r' C^-1 r + ln det C`` for ``C = noise + inflated scatter`` at all grid points, (1, g).
 
-    ``basis`` (m, g), ``scatter`` (k k, g): a column for each grid point, padded to whole vectors. C = L D L' by
-    rows, without roots; ``spare`` (k k + 3 k, LANES): L, then of the row at hand L D, 1 / D and L^-1 r.
+    ``basis`` (m, g), ``scatter`` (k k, g): a column for each grid point, padded to whole vectors.
+    C = L D L' by rows, without roots; ``spare`` (k k + 3 k, LANES): L, then L D of the row at hand, 1 / D and
+    L^-1 r.
     """
     k, terms = local.shape
     product, inverse, whitened = k * k, k * k + k, k * k + 2 * k

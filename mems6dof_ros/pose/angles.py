@@ -24,10 +24,11 @@ BETA_DETECTION = math.sqrt(-2 * math.log(0.05))
 ALPHA_DETECTION = 3.0
 
 
+@njit(cache=True, nogil=True)
 def swing_twist(rotation: Array) -> tuple[float, float, float]:
     """(tilt_x, tilt_y, psi) rad of ``rotation`` (3, 3), psi in (-pi, pi]; undefined only for a body
     upside down."""
-    nx, ny, nz = rotation[:, 2]
+    nx, ny, nz = rotation[0, 2], rotation[1, 2], rotation[2, 2]
     sine = math.hypot(nx, ny)
     scale = math.atan2(sine, nz) / sine if sine > 1e-12 else 1.0
     # n = Exp(tilt) z = z + tilt x z + ..., hence tilt is along (-ny, nx).
@@ -62,19 +63,20 @@ def paper_angles(displacement: Array, covariance: Array) -> PaperAngles:
     beta = |tilt| is Rician: noise across the tilt biases it by sd^2 / (2 beta); removed as
     ``sqrt(beta^2 - sd^2)`` (Gudbjartsson and Patz 1995), never below 0. gamma is psi, unwrapped.
     """
-    tilt, tilt_covariance = displacement[3:5], covariance[3:5, 3:5]
-    raw = math.hypot(*tilt)
-    along = tilt / raw if raw > 0 else np.array([1.0, 0.0])
-    across = np.array([-along[1], along[0]])
-    sd_along = math.sqrt(float(along @ tilt_covariance @ along))
-    sd_across = math.sqrt(float(across @ tilt_covariance @ across))
+    tilt_x, tilt_y, gamma = displacement[3:].tolist()
+    (xx, xy), (_, yy) = covariance[3:5, 3:5].tolist()
+    raw = math.hypot(tilt_x, tilt_y)
+    x, y = (tilt_x / raw, tilt_y / raw) if raw > 0 else (1.0, 0.0)
+    sd_along = math.sqrt(x * x * xx + 2 * x * y * xy + y * y * yy)
+    sd_across = math.sqrt(y * y * xx - 2 * x * y * xy + x * x * yy)
     # Distance from zero in standard deviations, in the metric of this covariance.
-    detection = math.sqrt(max(0.0, float(tilt @ np.linalg.solve(tilt_covariance, tilt))))
+    square = tilt_x * tilt_x * yy - 2 * tilt_x * tilt_y * xy + tilt_y * tilt_y * xx
+    detection = math.sqrt(max(0.0, square / (xx * yy - xy * xy)))
     beta = math.sqrt(max(0.0, raw**2 - sd_across**2))
     return PaperAngles(
-        alpha=math.atan2(-tilt[0], tilt[1]),
+        alpha=math.atan2(-tilt_x, tilt_y),
         beta=beta,
-        gamma=float(displacement[5]),
+        gamma=gamma,
         sd_alpha=min(sd_across / raw, math.pi / math.sqrt(3)) if raw > 0 else math.pi / math.sqrt(3),
         sd_beta=sd_along,
         sd_gamma=math.sqrt(float(covariance[5, 5])),

@@ -421,11 +421,13 @@ class PoseEstimator:
         retired = constellation.count(seen, np.flatnonzero(missed), rows, outlying)
         newcomers = view.only((match < 0) & view.good & view.has_z)
         joined, index = self._recruit(newcomers, constellation, state, rows, modes, solution)
-        newcomers = newcomers.only(index)
-        rows = np.r_[rows[good], joined]
-        position = np.r_[view.position[part[good]], newcomers.position]
-        weight = np.r_[weights(noise[good], solution.use[good] == FULL), np.linalg.inv(newcomers.covariance)]
-        modes = np.r_[modes[good], constellation.modes.evaluate(newcomers.position)]
+        rows, position = rows[good], view.position[part[good]]
+        weight, modes = weights(noise[good], solution.use[good] == FULL), modes[good]
+        if len(joined):
+            newcomers = newcomers.only(index)
+            rows, position = np.r_[rows, joined], np.r_[position, newcomers.position]
+            weight = np.r_[weight, np.linalg.inv(newcomers.covariance)]
+            modes = np.r_[modes, constellation.modes.evaluate(newcomers.position)]
         offset = position - state.pose.apply(constellation.linearisation(rows))
         constellation.observe(rows, state.pose, offset, weight, modes)
         if len(retired):

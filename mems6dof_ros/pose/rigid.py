@@ -119,9 +119,9 @@ def shift_origin(covariance: Array, lever: Array) -> Array:
     return jacobian @ covariance @ jacobian.T
 
 
+@njit(cache=True, nogil=True)
 def lever_jacobian(lever: Array) -> Array:
     """d(d', w) / d(d, w), (6, 6), of that change of origin."""
-    jacobian = np.zeros((6, 6))
-    np.fill_diagonal(jacobian, 1.0)
+    jacobian = np.eye(6)
     jacobian[:3, 3:] = -hat(lever)
     return jacobian

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from mems6dof_ros.errors import InputError
@@ -21,6 +23,8 @@ BEYOND = int(Flag.Z_OUT_OF_RANGE | Flag.OUT_OF_FIELD | Flag.OUT_OF_BRIGHTNESS)
 #: Flags with which a position is still good, but less than its covariance says: light of a neighbour, or a
 #: window cut by the edge of the image, adds an error about as large as the noise.
 DOUBTFUL, DOUBT = int(Flag.NEIGHBOUR | Flag.WINDOW_CUT), 2.0
+#: With these nothing is there.
+FAILED = int(Flag.FIT_FAILED)
 #: Standard deviation that stands for no knowledge of z, m.
 UNKNOWN_Z = 10e-6
 #: Standard deviations outside this range, m, are no measurement of a particle's place.
@@ -55,30 +59,56 @@ def usable(localizations: Localizations, available: Mask | None = None, beyond: 
     Raises InputError where the arrays do not fit together.
     """
     _check_shapes(localizations)
-    position, covariance, flags = localizations.position, localizations.covariance, localizations.flags
-    if beyond:
-        flags = flags & ~np.uint32(BEYOND)
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    lateral = variance[:, 0] * variance[:, 1] - covariance[:, 0, 1] ** 2
+    of, position, covariance, has_z, good = _judged(
+        localizations.position,
+        localizations.covariance,
+        localizations.flags.astype(np.int64) & (~BEYOND if beyond else -1),
+        np.ones(len(localizations), bool) if available is None else available,
+    )
+    return Usable(of, position, covariance, has_z, good)
+
+
+@njit(cache=True, nogil=True)
+def _judged(position, covariance, flags, available):  # type: ignore[no-untyped-def]
+    """The fields of Usable. What is NaN fails every comparison."""
     low, high = CREDIBLE[0] ** 2, CREDIBLE[1] ** 2
-    credible = (variance >= low) & (variance <= high)
-    near = np.abs(position) < FARTHEST  # not where NaN
-    keep = near[:, :2].all(axis=1) & credible[:, 0] & credible[:, 1] & (lateral > 0)
-    keep &= np.isfinite(lateral) & ((flags & int(Flag.FIT_FAILED)) == 0)
-    if available is not None:
-        keep &= available
-    of = np.flatnonzero(keep)
-    position, covariance, flags = position[of].copy(), covariance[of].copy(), flags[of].astype(np.int64)
-    a, b, c = covariance[:, 0, 1], covariance[:, 0, 2], covariance[:, 1, 2]
-    xx, yy, zz = variance[of].T
-    determinant = zz * lateral[of] - xx * c**2 - yy * b**2 + 2 * a * b * c
-    has_z = near[of, 2] & (determinant > 0) & credible[of, 2]
-    has_z &= (flags & LATERAL_ONLY) == 0
-    position[~has_z, 2] = 0.0
-    covariance[~has_z, 2, :] = covariance[~has_z, :, 2] = 0.0
-    covariance[~has_z, 2, 2] = UNKNOWN_Z**2
-    covariance[(flags & DOUBTFUL) != 0] *= DOUBT
-    return Usable(of, position, covariance, has_z, (flags & ~(LATERAL_ONLY | DOUBTFUL)) == 0)
+    of, has_z = np.empty(len(position), np.int64), np.empty(len(position), np.bool_)
+    good = np.empty(len(position), np.bool_)
+    places, covariances = np.empty_like(position), np.empty_like(covariance)
+    n = 0
+    for i in range(len(position)):
+        c = covariance[i]
+        lateral = c[0, 0] * c[1, 1] - c[0, 1] ** 2
+        if not (
+            available[i]
+            and (flags[i] & FAILED) == 0
+            and abs(position[i, 0]) < FARTHEST
+            and abs(position[i, 1]) < FARTHEST
+            and low <= c[0, 0] <= high
+            and low <= c[1, 1] <= high
+            and 0 < lateral < math.inf
+        ):
+            continue
+        determinant = (
+            c[2, 2] * lateral - c[0, 0] * c[1, 2] ** 2 - c[1, 1] * c[0, 2] ** 2
+            + 2 * c[0, 1] * c[0, 2] * c[1, 2]
+        )  # fmt: skip
+        of[n], places[n], covariances[n] = i, position[i], c
+        has_z[n] = (
+            (flags[i] & LATERAL_ONLY) == 0
+            and abs(position[i, 2]) < FARTHEST
+            and low <= c[2, 2] <= high
+            and determinant > 0
+        )
+        if not has_z[n]:
+            places[n, 2] = 0.0
+            covariances[n, 2, :] = covariances[n, :, 2] = 0.0
+            covariances[n, 2, 2] = UNKNOWN_Z**2
+        if flags[i] & DOUBTFUL:
+            covariances[n] *= DOUBT
+        good[n] = (flags[i] & ~(LATERAL_ONLY | DOUBTFUL)) == 0
+        n += 1
+    return of[:n], places[:n], covariances[:n], has_z[:n], good[:n]
 
 
 def scaled(covariance: Array, factor: Array) -> Array:

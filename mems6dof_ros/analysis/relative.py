@@ -124,8 +124,8 @@ def _errors(
     """Difference of the errors (n, 6) of both bodies, None unless the truth of both is known throughout."""
     errors = []
     for poses in zip(*pairs, strict=True):
-        truths = [truth for truth in recording.truth_of(list(poses)) if truth is not None]
-        if len(truths) < len(poses):
+        truths = recording.truth_of(list(poses))
+        if None in truths:
             return None
         errors.append(compare(poses, truths).error)
     return np.asarray(errors[0] - errors[1] * weight)

@@ -190,11 +190,9 @@ def _of_motion(
 
 def compare_with_truth(recording: Recording, body: str) -> TruthComparison | None:
     """Errors of the valid poses of ``body``, None where the recording has no truth of it."""
-    poses = recording.poses[body]
-    pairs = [
-        (p, t) for p, t in zip(poses, recording.truth_of(poses), strict=True) if p.valid and t is not None
-    ]
-    return compare([pose for pose, _ in pairs], [truth for _, truth in pairs]) if pairs else None
+    poses = [pose for pose in recording.poses[body] if pose.valid]
+    truths = recording.truth_of(poses)
+    return compare(poses, truths) if any(truth is not None for truth in truths) else None
 
 
 def _summary(

@@ -80,20 +80,23 @@ class TruthComparison:
 
 
 def compare(
-    poses: Sequence[CyclePose], truths: Sequence[GroundTruth], fit_microscope: bool = True
+    poses: Sequence[CyclePose], truths: Sequence[GroundTruth | None], fit_microscope: bool = True
 ) -> TruthComparison:
-    """Compare ``poses`` with the ``truths`` of the same frames, pairwise; invalid poses are skipped.
+    """Compare ``poses`` with the ``truths`` of the same frames, pairwise; invalid poses, and those whose
+    truth is not known (None), are skipped.
 
     ``fit_microscope`` False: the microscope frame is taken as true (L = 1). Raises InputError where
-    there is no valid pose or the lengths differ.
+    nothing is left or the lengths differ.
     """
     if len(poses) != len(truths):
         raise InputError(
             "truth comparison", f"{len(poses)} poses, {len(truths)} truths", "one truth per pose"
         )
-    pairs = [(pose, truth) for pose, truth in zip(poses, truths, strict=True) if pose.valid]
+    pairs = [
+        (pose, truth) for pose, truth in zip(poses, truths, strict=True) if pose.valid and truth is not None
+    ]
     if not pairs:
-        raise InputError("truth comparison", "no valid pose", "at least one")
+        raise InputError("truth comparison", "no valid pose with its truth", "at least one")
     microscope, bodies = _fit_constants(pairs, fit_microscope)
     error = np.array([_pose_error(p, t, microscope, bodies[p.reference_version]) for p, t in pairs])
     covariance = np.array([pose.covariance for pose, _ in pairs])

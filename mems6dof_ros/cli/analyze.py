@@ -119,9 +119,8 @@ def _lines_of_body(summary: Summary, body: str) -> list[str]:
     pairs = [pair for pair in zip(summary.poses, summary.truths, strict=True) if pair[0].body == body]
     counts = Counter(pose.status.name.lower() for pose, _ in pairs)
     lines = [f"{body} poses: " + ", ".join(f"{status} {count}" for status, count in sorted(counts.items()))]
-    known = [(pose, truth) for pose, truth in pairs if truth is not None and pose.valid]
-    if known:
-        comparison = compare([pose for pose, _ in known], [truth for _, truth in known])
+    if any(pose.valid and truth is not None for pose, truth in pairs):
+        comparison = compare([pose for pose, _ in pairs], [truth for _, truth in pairs])
         lines.append(f"{'against truth':14}{'rms error':>12}{'claimed':>12}")
         for name, error, claimed in comparison.table():
             unit, scale = ("nm", 1e9) if name in ("dx", "dy", "dz") else ("urad", 1e6)

@@ -117,7 +117,7 @@ def chain(
     image_topic: str = topics.IMAGE,
     recorded: Sequence[str] = (),
     record_images: bool = False,
-    compression: str = "",
+    recording: Mapping[str, Any] | None = None,
     controller: NodeSpec | None = None,
     watched: Mapping[str, str] | None = None,
     monitor: NodeSpec | None = None,
@@ -131,7 +131,8 @@ def chain(
     subscribers that the table gives it, and for those in ``watched`` (topic to the name of a node that is
     not in the table), so that nothing is lost at the beginning. Nobody waits for a monitor. ``bodies``: file
     of several bodies in view, whose topics are recorded too. What is empty is left to the parameter files in
-    ``config``, then to the nodes; ``record_images`` adds them to what is ``recorded``.
+    ``config``, then to the nodes; ``record_images`` adds them to what is ``recorded``; ``recording``: further
+    parameters of the recorder.
     """
     further = _topics_of_further(bodies)
     queue = {"queue_policy": queue_policy} if queue_policy else {}
@@ -149,8 +150,8 @@ def chain(
     if output:
         told = {
             "output": output,
-            "compression": compression,
             "attachments": [file for file in (calibration, bodies) if file],
+            **(recording or {}),
         }
         if recorded:
             told["topics"] = [*recorded, *further]

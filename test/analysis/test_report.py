@@ -103,6 +103,16 @@ def test_the_numbers_are_those_of_the_poses(bag, tmp_path):
     assert f"({step.mean() * 1e3:.2f} ±" in page
 
 
+def test_poses_without_their_truth_are_left_out(bag):
+    recording = load_recording(bag)
+    poses = [pose for pose in recording.poses["load_gear"] if pose.valid]
+    truths = recording.truth_of(poses)
+    truths[3] = None
+    assert compare(poses, truths).cycle.tolist() == [p.cycle for k, p in enumerate(poses) if k != 3]
+    with pytest.raises(InputError, match="no valid pose with its truth"):
+        compare(poses, [None] * len(poses))
+
+
 def test_earlier_references_are_expressed_in_the_last_one(bag):
     """The true path, apart from its zero, is what the poses must show once they share one reference."""
     recording = load_recording(bag)

@@ -45,12 +45,12 @@ def figures(settings: SimulationSettings, cycles: int, out: Path) -> list[Figure
 def _poses(recording: Recording, cycles: int) -> list[Figure]:
     """The demonstration against its truth."""
     poses = [pose for pose in recording.poses[BODY] if pose.valid]
-    truths = [truth for truth in recording.truth_of(poses) if truth is not None]
-    comparison = compare(poses, truths)
+    comparison = compare(poses, recording.truth_of(poses))
     rows = [
         exactly("four processes: frames published", recording.frames, cycles),
         exactly("four processes: valid poses", len(poses), cycles),
         exactly("four processes: frames lost", recording.frames - len(recording.poses[BODY]), 0),
+        exactly("four processes: poses with their truth", len(comparison.cycle), cycles),
     ]
     for name, error, _ in comparison.table():
         need = REQUIREMENTS[name]

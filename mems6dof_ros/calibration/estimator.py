@@ -150,12 +150,13 @@ class Estimator:
         beyond = (best < np.maximum(low, first + sd_u)) | (best > np.minimum(high, last - sd_u))
         flags = np.where(ambiguous, Flag.Z_AMBIGUOUS, 0) | np.where(beyond, Flag.Z_OUT_OF_RANGE, 0)
         flags |= np.where(chi_square[:, 0] > self._misfit, Flag.POOR_FIT, 0) | np.where(blind, Flag.NO_Z, 0)
-        covariance[ambiguous] = self._mixture(
-            position[ambiguous],
-            covariance[ambiguous],
-            self._corrected(*(a[ambiguous] for a in (measured, noise, local, inflation, second))),
-            z_gap[ambiguous],
-        )
+        if ambiguous.any():
+            covariance[ambiguous] = self._mixture(
+                position[ambiguous],
+                covariance[ambiguous],
+                self._corrected(*(a[ambiguous] for a in (measured, noise, local, inflation, second))),
+                z_gap[ambiguous],
+            )
         return position, covariance, z_gap, flags.astype(np.uint32)
 
     def _limits(self, local: Array) -> NDArray[np.int64]:

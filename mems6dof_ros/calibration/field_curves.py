@@ -11,6 +11,7 @@ leaving out whole beads in cross-validation costs next to nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -43,7 +44,13 @@ class FieldCurves:
         """Chebyshev coefficients of every curve at field positions ``x``, ``y`` (n,) m:
         (n, outputs, Chebyshev terms)."""
         terms = zernike(self.field_order, x / self.radius, y / self.radius)
-        return np.einsum("nj,kjm->nkm", terms, self.coefficients, optimize=True)
+        outputs, _, degrees = self.coefficients.shape
+        return (terms @ self._by_zernike).reshape(len(terms), outputs, degrees)
+
+    @cached_property
+    def _by_zernike(self) -> Array:
+        """The coefficients with a row for each Zernike term."""
+        return self.coefficients.transpose(1, 0, 2).reshape(self.coefficients.shape[1], -1)
 
     def basis(self, argument: Array) -> Array:
         """Chebyshev polynomials at ``argument`` (n,): (n, terms)."""

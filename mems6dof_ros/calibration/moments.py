@@ -54,24 +54,31 @@ def residual_moments(
     light-weighting; other weightings differ by a few per cent. NaN where a fit has failed.
     """
     offset, gain, read_variance = camera.maps
-    values = np.empty((len(fits), 5))
+    values, covariance = np.empty((len(fits), 5)), np.empty((len(fits), 5, 5))
     sums = np.empty((len(fits), 5, 5))
     kernels.residual_sums(
         kernels.pixels(image), np.ascontiguousarray(fits.parameters), offset, gain, window_px, _WIDTH, sums
     )
-    _moments(sums, fits.parameters, fits.flux, values)
-    beta = (fits.parameters[:, 6] + np.mean(read_variance)) / fits.parameters[:, 2]
-    with np.errstate(invalid="ignore"):
-        scale = 1 / fits.flux
-    covariance = scale[:, None, None] * (_LIGHT_NOISE + np.maximum(beta, 0)[:, None, None] * _FLAT_NOISE)
+    noise = float(np.mean(read_variance))
+    _moments(sums, fits.parameters, fits.flux, noise, _LIGHT_NOISE, _FLAT_NOISE, values, covariance)
     return Moments(values, covariance)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _moments(sums: Array, parameters: Array, flux: Array, values: Array) -> None:
-    """``values`` (n, 5): moments from ``sums`` (n, 5, 5) of r H u^i v^j; NaN where those are."""
+def _moments(
+    sums: Array,
+    parameters: Array,
+    flux: Array,
+    read_variance: float,
+    light_noise: Array,
+    flat_noise: Array,
+    values: Array,
+    covariance: Array,
+) -> None:
+    """``values`` (n, 5): moments from ``sums`` (n, 5, 5) of r H u^i v^j, with their ``covariance`` (n, 5, 5);
+    NaN where those are."""
     for n in range(len(sums)):
-        _, _, _, sx, sy, rho, _ = parameters[n]
+        _, _, amplitude, sx, sy, rho, background = parameters[n]
         # Symmetric square root of S^-1: (S + sqrt(det S) 1)^-1 sqrt(tr S + 2 sqrt(det S)).
         root = sx * sy * math.sqrt(1 - rho * rho)
         trace = math.sqrt(sx * sx + sy * sy + 2 * root)
@@ -88,6 +95,8 @@ def _moments(sums: Array, parameters: Array, flux: Array, values: Array) -> None
         values[n, 3] = (_mixed(sums[n], 1, 3, aa, ab, bb) - 3 * s11) / math.sqrt(6)
         values[n, 4] = (_mixed(sums[n], 0, 4, aa, ab, bb) - 6 * s02 + 3 * s00) / math.sqrt(24)
         values[n] /= flux[n]
+        flat = max((background + read_variance) / amplitude, 0.0)
+        covariance[n] = (light_noise + flat * flat_noise) / flux[n]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

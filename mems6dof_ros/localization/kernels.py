@@ -926,3 +926,19 @@ def close_pairs(positions: Array, distance: float) -> NDArray[np.int64]:
     for k in range(count):
         pairs[k, 0], pairs[k, 1] = sorted_pairs[k] // len(order), sorted_pairs[k] % len(order)
     return pairs
+
+
+@njit(**_OPTIONS)
+def nearest(positions: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Distance (n,) from each of ``positions`` (n, 2) to the nearest of ``others`` (m, 2), and which that is.
+
+    By trying all: for hundreds a third of the time of a tree, which is mostly its building.
+    """
+    distance, index = np.full(len(positions), np.inf), np.full(len(positions), -1)
+    for i in range(len(positions)):
+        for j in range(len(others)):
+            dx, dy = positions[i, 0] - others[j, 0], positions[i, 1] - others[j, 1]
+            square = dx * dx + dy * dy
+            if square < distance[i]:
+                distance[i], index[i] = square, j
+    return np.sqrt(distance), index

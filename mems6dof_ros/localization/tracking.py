@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
+from mems6dof_ros.localization import kernels
 from mems6dof_ros.localization.detection import detect
 from mems6dof_ros.localization.localizations import Flag, Localizations
 from mems6dof_ros.localization.localizer import Localizer
@@ -111,8 +111,7 @@ class TrackingLocalizer:
         pixel_size = self.localizer.check(frame)
         place = (detect(frame.image, self.localizer.settings.detection) + 0.5) * pixel_size - half_field
         known = found.position[np.isfinite(found.position[:, :2]).all(axis=1), :2]
-        if len(known) and len(place):
-            place = place[cKDTree(known).query(place)[0] > _SAME]
+        place = place[kernels.nearest(place, known)[0] > _SAME]
         self._newcomers = frame.cycle, place
         for motion in self._motions:
             self._welcome(motion)
@@ -145,7 +144,7 @@ class TrackingLocalizer:
         place = (position - transform[:3, 3]) @ transform[:3, :3]
         seen, fresh = np.empty(0, np.int64), np.ones(len(place), bool)
         if len(self._places) and len(place):
-            distance, nearest = cKDTree(self._places[:, :2]).query(place[:, :2])
+            distance, nearest = kernels.nearest(place, self._places)
             fresh = distance > _SAME
             seen = nearest[~fresh]
             self._places[seen], self._trusted[seen] = place[~fresh], good[~fresh]

@@ -181,7 +181,8 @@ def _results(
         frame = read.result()
         return None if frame is None else (frame, localizer.localize(frame))
 
-    ahead = workers if workers > 1 else 0  # frames under way behind the one that is waited for
+    # Frames under way behind the one that is waited for: enough to work on while poses and tables are made.
+    ahead = 2 * workers if workers > 1 else 0
     with ThreadPoolExecutor(1, "reader") as reader, ThreadPoolExecutor(workers, "localizer") as pool:
         reader.submit(source.start).result()
         try:

@@ -132,7 +132,7 @@ def tracking(material: Material) -> list[Row]:
 
 
 def from_file(material: Material) -> list[Row]:
-    """The same, read from an uncompressed TIFF stack; wall time, since reading waits."""
+    """The same, read from an uncompressed TIFF stack; reading by wall time, since it may wait."""
     path = material.directory / "frames.tif"
     with tifffile.TiffWriter(path, bigtiff=True) as stack:
         for frame in material.frames:
@@ -150,9 +150,9 @@ def from_file(material: Material) -> list[Row]:
     reading = []
     source.start()
     for _ in range(CYCLES):
-        begin = time.thread_time()
+        begin = time.monotonic()
         source.read()
-        reading.append(time.thread_time() - begin)
+        reading.append(time.monotonic() - begin)
     cycles = 2 * CYCLES if material.quick else 10 * CYCLES
     steps = run(frames(), material.localizer, cycles)
     each = float(np.median(reading))
@@ -170,8 +170,18 @@ def scaling(material: Material) -> list[Row]:
     by_count = [_cost(material, count, 2048) for count in counts]
     by_size = [_cost(material, 20, size) for size in sizes]  # few, so that 512 px hold them
     return [
-        _slope("cost against particles", [n for n, _ in by_count], [t for _, t in by_count], "particle"),
-        _slope("cost against the field", [size**2 / 1e6 for size in sizes], [t for _, t in by_size], "Mpx"),
+        _slope(
+            "detection and fits against particles",
+            [n for n, _ in by_count],
+            [t for _, t in by_count],
+            "particle",
+        ),
+        _slope(
+            "detection and fits against the field",
+            [size**2 / 1e6 for size in sizes],
+            [t for _, t in by_size],
+            "Mpx",
+        ),
     ]
 
 

@@ -40,14 +40,14 @@ class BagSource:
                 raise InputError(str(path), f"no images on topic '{self._topic}'", _choices(bag))
             self._count = bag.counts[self._topic]
             stated = bag.provenance().get(CAMERA)
-        namespace = self._topic.rsplit("/", 1)[0]
-        self._info_topic, self._truth_topic = (
-            f"{namespace}/{topics.FRAME_INFO}",
-            f"{namespace}/{topics.TRUTH}",
-        )
-        self.start()
-        first = self.read()
-        self.stop()
+            namespace = self._topic.rsplit("/", 1)[0]
+            self._info_topic, self._truth_topic = (
+                f"{namespace}/{topics.FRAME_INFO}",
+                f"{namespace}/{topics.TRUTH}",
+            )
+            self._iterator, self._read = self._parts(bag), 0
+            first = self.read()
+            self.stop()
         if first is None:
             raise InputError(str(path), f"no message on '{self._topic}'", "at least one image")
         height, width = first.image.shape
@@ -59,7 +59,7 @@ class BagSource:
         return self._info
 
     def start(self) -> None:
-        self._iterator, self._read = self._parts(), 0
+        self._iterator, self._read = self._opened(), 0
 
     def read(self, timeout: float | None = None) -> Frame | None:
         parts = next((parts for parts in self._iterator if "image" in parts), None)
@@ -75,24 +75,27 @@ class BagSource:
     def stop(self) -> None:
         self._iterator = iter(())
 
-    def _parts(self) -> Iterator[dict[str, Any]]:
+    def _opened(self) -> Iterator[dict[str, Any]]:
+        with BagReader(self._path) as bag:
+            yield from self._parts(bag)
+
+    def _parts(self, bag: BagReader) -> Iterator[dict[str, Any]]:
         """Messages of one stamp belong together."""
         pending: dict[int, dict[str, Any]] = {}
         wanted = self._topic, self._info_topic, self._truth_topic
-        with BagReader(self._path) as bag:
-            for recorded in bag.messages(wanted, self.threads):
-                stamp = messages.nanoseconds(recorded.message.header.stamp)
-                if recorded.topic == self._topic and "image" in pending.get(stamp, {}):
-                    yield pending.pop(stamp)  # a stamp that repeats (unset?) tells nothing apart
-                parts = pending.setdefault(stamp, {})
-                if recorded.topic == self._topic:
-                    parts["image"] = recorded.message
-                elif recorded.topic == self._info_topic:
-                    parts["info"] = recorded.message
-                else:
-                    parts.setdefault("truth", []).append(recorded.message)
-                if len(pending) > _LOOK_AHEAD:
-                    yield pending.pop(next(iter(pending)))
+        for recorded in bag.messages(wanted, self.threads):
+            stamp = messages.nanoseconds(recorded.message.header.stamp)
+            if recorded.topic == self._topic and "image" in pending.get(stamp, {}):
+                yield pending.pop(stamp)  # a stamp that repeats (unset?) tells nothing apart
+            parts = pending.setdefault(stamp, {})
+            if recorded.topic == self._topic:
+                parts["image"] = recorded.message
+            elif recorded.topic == self._info_topic:
+                parts["info"] = recorded.message
+            else:
+                parts.setdefault("truth", []).append(recorded.message)
+            if len(pending) > _LOOK_AHEAD:
+                yield pending.pop(next(iter(pending)))
         yield from pending.values()
 
 

@@ -11,7 +11,7 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import KAPPA, WEIGHTINGS, fit_gaussians
 from mems6dof_ros.localization.gaussian import cramer_rao, gaussian, pixel_grid, reference_fit, window_weights
-from mems6dof_ros.localization.kernels import close_pairs
+from mems6dof_ros.localization.kernels import close_pairs, nearest
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
 from mems6dof_ros.localization.validation import matched_field, physical_field
 
@@ -242,3 +242,15 @@ def test_close_pairs_are_those_of_a_tree(count: int) -> None:
     positions = np.random.default_rng(count).uniform(0, 100, (count, 2))
     expected = sorted(cKDTree(positions).query_pairs(7.0)) if count else []
     np.testing.assert_array_equal(close_pairs(positions, 7.0), np.array(expected).reshape(-1, 2))
+
+
+def test_the_nearest_are_those_of_a_tree() -> None:
+    rng = np.random.default_rng(3)
+    positions, others = rng.uniform(0, 1e-4, (50, 3)), rng.uniform(0, 1e-4, (70, 2))
+    distance, index = nearest(positions, others)
+    expected = cKDTree(others).query(positions[:, :2])
+    np.testing.assert_allclose(distance, expected[0], rtol=1e-12)
+    np.testing.assert_array_equal(index, expected[1])
+    nothing, none = nearest(positions, others[:0])
+    assert (nothing == np.inf).all()
+    assert (none == -1).all()

@@ -49,8 +49,11 @@ def optical_chain(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> OpticalRun:
     """Calibrate simulated optics from focus stacks, render ``cycles`` of the turning gear, localize them by
-    ``method`` (see calibration), estimate: minutes. ``electrons``: mean light of the particles in view."""
-    settings = SimulationSettings.from_dict({"seed": seed, "optics_seed": seed, "electrons": electrons})
+    ``method`` (see calibration), estimate: minutes. ``seed``: of optics, camera, gear, motion and noise;
+    ``electrons``: mean light of the particles in view."""
+    settings = SimulationSettings.from_dict(
+        {"seed": seed, "optics_seed": seed, "camera_seed": seed, "electrons": electrons}
+    )
     calibration = calibrate_simulated(settings, psf=method == "psf").calibration.with_method(method)
     localizer, estimator = Localizer(camera_noise(settings), calibration), PoseEstimator()
     # Some hundred particles of random brightness, less lit at the edges, have not the mean that was set.

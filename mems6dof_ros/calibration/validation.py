@@ -335,12 +335,14 @@ def brightness_figures(seeds: Sequence[int], tell: Tell) -> list[Figure]:
                 at_most(f"z rms over calibrated in kind, {name}", crossed.rms(2) / same.rms(2), limit),
                 information(f"claimed over actual z, {name}", crossed.claimed_over_actual(2)),
                 information(f"particles without a flag, {name}", crossed.kept),
-                *_bias(name, found[method, at, of], found[method, at, at], truth),
+                *brightness_bias(name, found[method, at, of], found[method, at, at], truth),
             ]
     return table
 
 
-def _bias(name: str, there: Sequence[Errors], here: Sequence[Errors], truth: Sequence[Array]) -> list[Figure]:
+def brightness_bias(
+    name: str, there: Sequence[Errors], here: Sequence[Errors], truth: Sequence[Array]
+) -> list[Figure]:
     """Mean change of z from ``here`` to ``there``, of one set of optics each, in the worst of them; and in
     the worst third of the true z, in the mean of all."""
     change = [p.z - q.z for p, q in zip(there, here, strict=True)]

@@ -20,10 +20,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "analyze",
         help="measure a recording: localizations and poses",
-        description="Measure a bag, a TIFF stack or a folder of images, and write a bag, cycles.csv and "
-        "localizations.csv. The same input gives the same results, digit for digit.",
+        description="Measure a bag, a TIFF stack, a folder of images or a video, and write a bag, cycles.csv "
+        "and localizations.csv. The same input gives the same results, digit for digit.",
     )
-    parser.add_argument("input", type=Path, help="bag, .mcap file, TIFF stack or folder of images")
+    parser.add_argument("input", type=Path, help="bag, .mcap file, TIFF stack, folder of images or video")
     parser.add_argument(
         "--calibration", required=True, help="calibration file, or 'none': x and y only, and no pose"
     )

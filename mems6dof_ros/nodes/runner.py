@@ -2,7 +2,7 @@
 
 From a shell, with the arguments of ``ros2 launch``::
 
-    python -m mems6dof_ros.nodes.runner replay bag:=recording calibration:=optics.yaml
+    python -m mems6dof_ros.nodes.runner replay recording:=bag calibration:=optics.yaml
 """
 
 from __future__ import annotations

@@ -25,6 +25,7 @@ from mems6dof_ros.recording.frames import camera_to_json
 from mems6dof_ros.recording.poses import pose_topics
 from mems6dof_ros.simulation.settings import SimulationSettings
 from mems6dof_ros.sources.simulator import camera_noise
+from mems6dof_ros.sources.source import kind_of
 
 #: What each node publishes and can be told to hold back until somebody listens.
 _PUBLISHED = {
@@ -190,9 +191,15 @@ def commanded(**settings: Any) -> NodeSpec:
     )
 
 
-def replayed(bag: str, topic: str = "", **parameters: Any) -> NodeSpec:
-    """A frame_source that replays a bag and ends when all of it has become poses; further ``parameters``."""
-    return _finite("bag", {"bag.path": bag, "bag.topic": topic, **parameters})
+def replayed(recording: str, topic: str = "", **parameters: Any) -> NodeSpec:
+    """A frame_source that replays a bag, TIFF stack, folder of images or video, and ends when all of it has
+    become poses; further ``parameters``. Empty: a bag, which a parameter file names."""
+    kind = kind_of(Path(recording)) if recording else "bag"
+    if kind == "bag":
+        parameters["bag.topic"] = topic
+    elif topic:
+        raise InputError("argument topic", f"'{topic}' of {recording}", "none, which only bags have")
+    return _finite(kind, {f"{kind}.path": recording, **parameters})
 
 
 def _finite(kind: str, options: Mapping[str, Any]) -> NodeSpec:
@@ -252,7 +259,7 @@ def _camera(values: Mapping[str, str], rate: float) -> NodeSpec:
 def _replay(values: Mapping[str, str]) -> list[NodeSpec]:
     # What is not told is left to the parameter files.
     told = {name: kind(values, name) for name, kind in _REPLAYING.items() if values[name]}
-    return chain(replayed(values["bag"], values["topic"], **told), **_common(values))
+    return chain(replayed(values["recording"], values["topic"], **told), **_common(values))
 
 
 def _demo(values: Mapping[str, str]) -> list[NodeSpec]:
@@ -425,10 +432,10 @@ SYSTEMS = {
         _live,
     ),
     "replay": System(
-        "A bag, nothing lost.",
+        "A recording, nothing lost.",
         {
-            "bag": ("", "Directory of a rosbag2 bag, or an .mcap file"),
-            "topic": ("", "Topic of its images; empty: the only one, or the only one named image_raw"),
+            "recording": ("", "rosbag2 bag, .mcap file, TIFF or OME-TIFF stack, folder of images, or video"),
+            "topic": ("", "Topic of a bag's images; empty: the only one, or the only one named image_raw"),
             "speed": ("", "At most so many times as fast as recorded; empty: as fast as the nodes take it"),
             "begin": ("", "Seconds of the recording to leave out at its beginning"),
             "loop": ("", "true: begin again at the end, with stamps that follow"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,17 +87,33 @@ def open_source(kind: str, **options: Any) -> FrameSource:
     return source(**options)
 
 
+#: What tells a video file, in small letters.
+VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
+
+
 def is_bag(path: Path) -> bool:
-    """True where ``path`` is a bag rather than images."""
-    return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists()
+    """True where ``path`` is a bag, also one that was never completed, rather than images."""
+    files = [path, *path.iterdir()] if path.is_dir() else [path]
+    return any(file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in files)
 
 
-def open_recording(path: Path, topic: str = "", **images: Any) -> FrameSource:
-    """The bag at ``path``, images on ``topic`` (empty: the only one), or the image stack or folder of
-    images, with options ``images`` of ImagesSource."""
+def kind_of(path: Path) -> str:
+    """The source that reads the recording at ``path``: bag, video or images; InputError: nothing is there."""
+    if not path.exists():
+        raise InputError(str(path), "nothing there", "a bag, TIFF stack, folder of images or video")
     if is_bag(path):
-        return open_source("bag", path=path, topic=topic)
-    return open_source("images", path=path, **images)
+        return "bag"
+    return "video" if path.suffix.lower() in VIDEO_SUFFIXES else "images"
+
+
+def open_recording(path: Path, topic: str = "", **images: float) -> FrameSource:
+    """The bag at ``path``, images on ``topic`` (empty: the only one), or the image stack, folder of images or
+    video, with options ``images`` of its source, NaN: not told; InputError for one that it does not have."""
+    kind = kind_of(path)
+    if kind == "bag":
+        return open_source(kind, path=path, topic=topic)
+    told = {name: value for name, value in images.items() if not math.isnan(value)}
+    return open_source(kind, path=path, **told)
 
 
 def frames(source: FrameSource) -> Iterator[Frame]:

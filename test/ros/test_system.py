@@ -7,12 +7,15 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import rclpy
+import tifffile
 import yaml
 from peers import PATIENCE, SMALL_GEAR, alive, own_domain, wait_until
 from rclpy.context import Context
@@ -232,12 +235,75 @@ def test_tables_are_complete(name: str) -> None:
         system.table({"bagg": "x"})
 
 
-def test_a_replay_is_told_how() -> None:
-    values = {"bag": "b", "speed": "2", "begin": "1.5", "loop": "true", "publish_clock": "true"}
-    source = SYSTEMS["replay"].table(values)[0].parameters
+def test_a_replay_is_told_how(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").touch()
+    values = {"recording": str(tmp_path / "a.mcap"), "speed": "2", "begin": "1.5", "loop": "true"}
+    source = SYSTEMS["replay"].table({**values, "publish_clock": "true"})[0].parameters
     assert {"speed": 2.0, "begin": 1.5, "loop": True, "publish_clock": True}.items() <= source.items()
     assert "start_paused" not in source  # left to a parameter file
     assert source["pacing"] == "consumer"  # nothing is lost, however fast
+
+
+def _stack(path: Path, images: list[np.ndarray]) -> Path:
+    tifffile.imwrite(path / "stack.ome.tif", np.array(images), metadata={"axes": "TYX"})
+    return path / "stack.ome.tif"
+
+
+def _folder(path: Path, images: list[np.ndarray]) -> Path:
+    (path / "folder").mkdir()
+    for k, image in enumerate(images):
+        cv2.imwrite(str(path / "folder" / f"{k}.png"), image)
+    return path / "folder"
+
+
+def _video(path: Path, images: list[np.ndarray]) -> Path:
+    height, width = images[0].shape
+    grey = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    codec = int.from_bytes(b"FFV1", "little")
+    writer = cv2.VideoWriter(str(path / "a.mkv"), cv2.CAP_FFMPEG, codec, 25.0, (width, height), grey)
+    for image in images:
+        writer.write(image)
+    writer.release()
+    return path / "a.mkv"
+
+
+@pytest.mark.parametrize(
+    ("write", "arrangement"),
+    [(_stack, "processes"), (_folder, "pipeline"), (_video, "pipeline"), (None, "pipeline")],
+)
+def test_any_recording_is_replayed_by_its_path(
+    recording: tuple[Path, dict[str, int], str],
+    calibration: str,
+    tmp_path: Path,
+    write: Callable[[Path, list[np.ndarray]], Path] | None,
+    arrangement: str,
+) -> None:
+    """By the command: the same pixels in other files (None: the bag) give the poses recorded live."""
+    images = [frame.image for frame in frames(open_source("bag", path=recording[0]))]
+    values = {
+        "recording": write(tmp_path, images) if write else recording[0],
+        "calibration": calibration,
+        "output": tmp_path / "bag",
+        "arrangement": arrangement,
+    }
+    words = [f"{name}:={value}" for name, value in values.items()]
+    command = [sys.executable, "-m", "mems6dof_ros.nodes.runner", "replay", *words]
+    done = subprocess.run(command, capture_output=True, text=True, env=_with_path(), timeout=PATIENCE)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with BagReader(recording[0]) as bag:
+        live = [messages.to_cycle_pose(recorded.message) for recorded in bag.messages(["/pose_6dof"])]
+    with BagReader(tmp_path / "bag") as bag:
+        replayed = [messages.to_cycle_pose(recorded.message) for recorded in bag.messages(["/pose_6dof"])]
+    assert len(replayed) == CYCLES
+    for pose, same in zip(replayed, live, strict=True):
+        np.testing.assert_allclose(pose.displacement, same.displacement, rtol=0, atol=1e-12)
+
+
+def test_a_recording_that_cannot_be_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"absent: found nothing there; expected a bag, TIFF stack, folder"):
+        SYSTEMS["replay"].table({"recording": str(tmp_path / "absent")})
+    with pytest.raises(InputError, match=r"argument topic: found '/image' of .*; expected none"):
+        SYSTEMS["replay"].table({"recording": str(tmp_path), "topic": "/image"})
 
 
 @pytest.mark.parametrize(

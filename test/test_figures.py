@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from mems6dof_ros.cli.figures import conclude
 from mems6dof_ros.figures import at_least, at_most, between, exactly, figure, information, remark
 
 
@@ -43,3 +44,14 @@ def test_a_remark_has_no_number():
     assert row["quantity"] == "not measured: no camera"
     assert math.isnan(row["measured"])
     assert row["passed"] is None
+
+
+def test_what_was_not_measured_is_not_taken_for_passed(capsys):
+    rows = [exactly("n", 1, 1), exactly("m", 1, 2), information("f", 3.0), remark("not measured: no camera")]
+    assert conclude(rows, {}, None) == 1
+    assert conclude(rows[:1], {}, None) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "1 passed, 1 failed, 1 not measured here",
+        "1 passed, 0 failed",
+    ]
+    assert conclude(rows[3:], {}, None) == 1

@@ -30,10 +30,11 @@ def print_table(figures: Sequence[Figure]) -> None:
 
 
 def conclude(figures: Sequence[Figure], parameters: Mapping[str, Any], path: Path | None) -> int:
-    """Count the verdicts, write the figures to ``path`` where there is one; returns the exit status: 1 where
-    a figure missed its requirement, or nothing was measured."""
+    """Count the verdicts, and the remarks, lest they be taken for passed; write the figures to ``path``, if
+    any; returns the exit status: 1 where a figure missed its requirement, or nothing was measured."""
     passed, failed = (sum(row["passed"] is verdict for row in figures) for verdict in (True, False))
-    print(f"{passed} passed, {failed} failed")
+    remarks = sum(row["passed"] is None and math.isnan(row["measured"]) for row in figures)
+    print(f"{passed} passed, {failed} failed" + (f", {remarks} not measured here" if remarks else ""))
     if path:
         record = {
             "format": "mems6dof validation 1",

@@ -33,8 +33,9 @@ DRIVE = 90.0
 START = 240.0
 #: Growth, MiB per 10 000 cycles, above which 200 bytes of each cycle are kept; 600 cycles tell less.
 LEAK, LEAK_QUICK = 2.0, 50.0
-#: Of the disk's sequential rate, which frames to be recorded may take.
-DISK_SHARE = 0.8
+#: Of the disk's sequential rate, and of what the chain does without, that recorded frames may take: to copy,
+#: check and write one costs two cores about as much as to measure it.
+DISK_SHARE, CHAIN_SHARE = 0.8, 0.3
 #: Messages before the clocks run: the constellation is then known.
 WARM_UP = 4 * CYCLES
 
@@ -104,7 +105,7 @@ def recorder(material: Material) -> list[Row]:
     """What a recorder beside the chain takes of its rate, and whether it writes all frames too.
 
     At the drive's rate, or nine tenths of what the chain can do: beyond it whatever runs takes its share.
-    Frames at what the disk takes, less a share for what it does besides.
+    Frames at what the disk and the processors take.
     """
     free = _chain(material, 0.0)
     rate = min(DRIVE, 0.9 * free.rate)
@@ -114,7 +115,7 @@ def recorder(material: Material) -> list[Row]:
     output = material.directory / "recorded_frames"
     size = 2e-6 * material.size**2
     disk = _disk_rate(material.directory)
-    with_frames = min(DRIVE, DISK_SHARE * disk / size)
+    with_frames = min(CHAIN_SHARE * free.rate, DISK_SHARE * disk / size)
     frames = _chain(material, with_frames, output=output, images=True)
     gaps = _missing(output, topics.IMAGE)
     missing = _missing(material.directory / "recorded", topics.POSE_6DOF)

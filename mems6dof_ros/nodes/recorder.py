@@ -67,6 +67,9 @@ DEFAULT_TOPICS = tuple(name for name in KNOWN_TYPES if name != topics.IMAGE)
 #: More than their publisher keeps: what it takes for acknowledged waits here until it is taken.
 _IMAGES_KEPT, _IMAGE = 3 * transport.FRAMES.depth, KNOWN_TYPES[topics.IMAGE]
 
+#: Of the queue, that images may fill: where the disk does not keep up with them, nothing else is lost.
+_IMAGES_SHARE = 0.9
+
 #: A message of one of these types completes a motion cycle, upon which what has been recorded so far is
 #: flushed: of those that come, the first in this order.
 _CYCLE_TYPES = ("mems6dof_msgs/msg/Pose6DOF", "mems6dof_msgs/msg/Localizations", "sensor_msgs/msg/Image")
@@ -255,7 +258,8 @@ class RecorderNode(InstrumentNode):
             )
             self.health.count("messages")
             self._account(received)
-            self.worker.put(functools.partial(self._write, bag, received), len(data))
+            share = _IMAGES_SHARE if channel.type == _IMAGE else 1.0
+            self.worker.put(functools.partial(self._write, bag, received), len(data), share)
 
     def _account(self, received: _Received) -> None:
         """Count what the wire lost; with several publishers on a topic the numbers do not tell."""

@@ -45,18 +45,21 @@ class Worker(Generic[Item]):
         """Fraction of the capacity that is taken."""
         return self._waiting / self._capacity
 
-    def put(self, item: Item, size: int = 1) -> None:
+    def put(self, item: Item, size: int = 1, share: float = 1.0) -> None:
         """Append ``item``, see ``policy``; ignored once the worker has ended.
 
-        An item greater than the capacity waits, or goes, alone.
+        An item greater than the capacity waits, or goes, alone. What may fill but a ``share`` of the capacity
+        is itself dropped beyond it: it pushes nothing else out.
         """
         with self._changed:
-            while self._items and self._waiting + size > self._capacity and not self._ending:
-                if self._policy == "drop_oldest":
-                    self._take()
-                    self.dropped += 1
-                else:
+            while self._items and self._waiting + size > share * self._capacity and not self._ending:
+                if self._policy == "block":
                     self._changed.wait()
+                    continue
+                self.dropped += 1
+                if share < 1:
+                    return
+                self._take()
             if not self._ending:
                 self._items.append((item, size))
                 self._waiting += size

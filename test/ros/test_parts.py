@@ -110,6 +110,26 @@ def test_worker_drops_the_oldest_and_counts() -> None:
     assert done == [0, 4, 5]
 
 
+def test_worker_lets_bulky_items_push_nothing_out() -> None:
+    gate, done = threading.Event(), []
+
+    def work(item: str) -> None:
+        gate.wait()
+        done.append(item)
+
+    worker = Worker(work, capacity=100, policy="drop_oldest")
+    worker.put("first")
+    while len(worker):
+        pass
+    for number in range(5):
+        worker.put(f"image {number}", 40, share=0.9)
+        worker.put(f"pose {number}", 2)
+    assert worker.dropped == 3
+    gate.set()
+    assert worker.end() == 0
+    assert done == ["first", "image 0", "pose 0", "image 1", *(f"pose {number}" for number in range(1, 5))]
+
+
 def test_worker_blocks_instead_of_losing() -> None:
     done: list[int] = []
     worker = Worker(done.append, capacity=1)

@@ -35,7 +35,7 @@ START = 240.0
 LEAK, LEAK_QUICK = 2.0, 50.0
 #: Of the disk's sequential rate, and of what the chain does without, that recorded frames may take: to copy,
 #: check and write one costs two cores about as much as to measure it.
-DISK_SHARE, CHAIN_SHARE = 0.8, 0.3
+DISK_SHARE, CHAIN_SHARE = 0.8, 0.2
 #: Messages before the clocks run: the constellation is then known.
 WARM_UP = 4 * CYCLES
 

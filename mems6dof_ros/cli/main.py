@@ -9,6 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from mems6dof_ros import __version__
+from mems6dof_ros.allocator import keep_memory
 from mems6dof_ros.errors import Mems6dofError
 
 #: Subcommand to module, or to further subcommands. A module has ``add_parser(subparsers)``, which adds its
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     # Small linear algebra in many threads is five times slower than in one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    keep_memory()
     try:
         args = build_parser(arguments).parse_args(arguments)
         return int(args.run(args))

@@ -23,6 +23,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 
+from mems6dof_ros.allocator import keep_memory
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.health import Health
@@ -241,6 +242,7 @@ def run(create: Callable[[], InstrumentNode], args: list[str] | None = None, *, 
     failed, with one line that says why. ``frames``: the node publishes images.
     """
     _die_with_parent()
+    keep_memory()
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -12,8 +12,9 @@ from typing import Any
 
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
+from std_msgs.msg import Float64
 
-from mems6dof_msgs.msg import Localizations
+from mems6dof_msgs.msg import ActuationAcknowledgement, ActuationCommand, FrameInfo, Localizations, Pose6DOF
 
 _UINT32, _UINT64 = 2**32 - 1, 2**64 - 1
 
@@ -42,6 +43,14 @@ IMAGE_FAULTS: dict[str, Callable[[Image], None]] = {
     ),
 }
 
+#: By name: what is done to a good FrameInfo so that its image cannot be measured.
+INFO_FAULTS: dict[str, Callable[[FrameInfo], None]] = {
+    "pixels of other optics": lambda info: _set(info, pixel_size=2 * info.pixel_size),
+    "pixels of no size": lambda info: _set(info, pixel_size=0.0),
+    "infinite pixels": lambda info: _set(info, pixel_size=math.inf),
+    "another camera's saturation": lambda info: _set(info, saturation_adu=1),
+}
+
 #: By name: what is done to good Localizations so that they contradict themselves.
 LOCALIZATIONS_FAULTS: dict[str, Callable[[Localizations], None]] = {
     "x too short": lambda found: _set(found, x=found.x[:-1]),
@@ -66,6 +75,14 @@ LOCALIZATIONS_NONSENSE: dict[str, Callable[[Localizations], None]] = {
     "fits NaN": lambda found: _fill(found, ("x", "y", "x_px", "sigma_x_px", "chi_square", "z_gap"), math.nan),
     "all flags": lambda found: _fill(found, ("flags",), _UINT32),
 }
+
+#: Of topics whose middleware drops what is no message: what every one that subscribes to them must refuse.
+REFUSABLE = (
+    Float64(data=math.nan),
+    Pose6DOF(body="load_gear", status=255),
+    ActuationAcknowledgement(status=255),
+    ActuationCommand(id=1, cycles=_UINT32),
+)
 
 
 def spoiled(good: Any, fault: Callable[[Any], None]) -> Any:

@@ -1,8 +1,8 @@
 """Memory for frames: kept by the process instead of fetched anew from the system for each.
 
-A frame of 8 MiB is beyond what the C library keeps of its own accord. It returns such a block at once, and the
-next one comes as 2000 pages that the system clears one by one. To record a frame into memory takes 6 ms instead
-of 12 where they are kept.
+A frame of 8 MiB is beyond what the C library keeps of its own accord. It returns such a block at once, and
+the next one comes as 2000 pages that the system clears one by one. To record a frame into memory takes
+6 ms instead of 12 where they are kept.
 """
 
 from __future__ import annotations

@@ -14,25 +14,28 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mcap.reader import make_reader
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from mems6dof_msgs.msg import ControllerState, FrameInfo, Localizations, Pose6DOF
+from mems6dof_msgs.msg import ActuationAcknowledgement, ControllerState, FrameInfo, Localizations, Pose6DOF
 from mems6dof_ros.calibration.calibrate import calibrate
 from mems6dof_ros.calibration.file import load_calibration, save_calibration
 from mems6dof_ros.calibration.focus_stack import DEFAULT_WINDOW_PX, measure_stack
-from mems6dof_ros.figures import Figure, at_most, exactly, information
+from mems6dof_ros.figures import Figure, at_least, at_most, exactly, information
 from mems6dof_ros.frame import Frame
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING
 from mems6dof_ros.localization.localizer import Localizer
+from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.actuation import ANSWERS
 from mems6dof_ros.nodes.system import NodeSpec, chain, commanded
 from mems6dof_ros.nodes.validation import broken
-from mems6dof_ros.nodes.validation.bystander import running
+from mems6dof_ros.nodes.validation.bystander import Bystander, running
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.pose.estimator import PoseEstimator
 from mems6dof_ros.recording import messages, topics
@@ -47,8 +50,16 @@ SAME = 1e-12
 #: Topics of ROS 2 itself.
 _NOT_OURS = ("/parameter_events", "/rosout", "/clock")
 RCLError = rclpy_implementation.RCLError
+_Fault = Callable[[Any], None]
 _RESTING = (ControllerState.STATE_ARRIVED, ControllerState.STATE_STOPPED)
 _MOST_TRIES = 12
+
+#: A FrameInfo is refused with its image, of which ``broken_frames`` sends both.
+_REFUSED_ELSEWHERE = ("localizer", topics.FRAME_INFO)
+
+
+def _no_fault(message: Any) -> None:
+    """Leave a message as it is."""
 
 
 def figures(work: Path, seed: int, tell: Callable[[str], None]) -> Iterator[Figure]:
@@ -74,8 +85,8 @@ def calibrate_quickly(settings: SimulationSettings, path: Path) -> None:
 def broken_frames(
     settings: SimulationSettings, calibration: Path, cycles: int, work: Path
 ) -> Iterator[Figure]:
-    """Of localizer and pose_estimator: before each of ``cycles`` good frames a broken one and nonsense in
-    place of localizations; after it, what comes again and late."""
+    """Of localizer and pose_estimator: before each of ``cycles`` good frames one with a broken image or
+    FrameInfo, and nonsense in place of localizations; after it, what comes again and late."""
     # Two of three cycles and frame numbers are left to what is broken.
     good = [
         replace(frame, cycle=3 * frame.cycle, frame_counter=3 * frame.frame_counter + 2)
@@ -102,17 +113,20 @@ def broken_frames(
         def wait_for_pose_of(stamp_ns: int) -> None:
             bystander.until(lambda: poses[stamp_ns], f"pose of {stamp_ns} ns")
 
-        def send(frame: Frame, fault: Callable[[Image], None] = lambda image: None) -> None:
-            infos.publish(messages.to_rclpy(messages.frame_info(frame)))
-            images.publish(broken.spoiled(messages.to_rclpy(messages.image(frame)), fault))
+        def send(frame: Frame, of_image: _Fault = _no_fault, of_info: _Fault = _no_fault) -> None:
+            infos.publish(broken.spoiled(messages.to_rclpy(messages.frame_info(frame)), of_info))
+            images.publish(broken.spoiled(messages.to_rclpy(messages.image(frame)), of_image))
 
+        frame_faults = [
+            *((fault, _no_fault) for fault in broken.IMAGE_FAULTS.values()),
+            *((_no_fault, fault) for fault in broken.INFO_FAULTS.values()),
+        ]
         broken_images = broken_localizations = repeated = 0
         for k, (frame, there) in enumerate(zip(good, found, strict=True)):
             between = replace(
                 frame, stamp_ns=frame.stamp_ns - 4_000_000, frame_counter=frame.frame_counter - 2
             )
-            image_faults = list(broken.IMAGE_FAULTS.values())
-            send(replace(between, cycle=frame.cycle - 2), image_faults[k % len(image_faults)])
+            send(replace(between, cycle=frame.cycle - 2), *frame_faults[k % len(frame_faults)])
             broken_images += 1
             wait_for_pose_of(between.stamp_ns)
             message = messages.to_rclpy(messages.localizations(there))
@@ -152,7 +166,7 @@ def broken_frames(
     yield exactly("poses beyond one a frame", sum(len(p) - 1 for p in poses.values()), 0)
     total = broken_images + repeated
     yield exactly(
-        f"localizer: images refused of {total} broken, repeated or late", refused["localizer"], total
+        f"localizer: frames refused of {total} broken, repeated or late", refused["localizer"], total
     )
     total = broken_localizations + repeated
     yield exactly(
@@ -166,12 +180,44 @@ def broken_frames(
     yield exactly("pose_estimator: localizations lost", counted["pose_estimator"].get("lost", 0), 0)
 
 
+@contextlib.contextmanager
+def _again_and_late(bystander: Bystander) -> Iterator[None]:
+    """Every pose and every acknowledgement comes again, and then the one before it."""
+    echoing = True
+
+    def echo(kind: type, topic: str, quality: QoSProfile, name: Callable[[Any], Any]) -> None:
+        publisher = bystander.node.create_publisher(kind, topic, quality)
+        known: dict[Any, Any] = {}
+
+        def on_message(message: Any) -> None:
+            if name(message) in known:  # our own
+                return
+            before = next(reversed(known.values()), message)
+            known[name(message)] = message
+            if echoing:
+                publisher.publish(message)
+                publisher.publish(before)
+
+        bystander.listen(kind, topic, on_message, quality)
+
+    echo(Pose6DOF, topics.POSE_6DOF, transport.MESSAGES, lambda pose: pose.frame_counter)
+    echo(
+        ActuationAcknowledgement,
+        topics.ACTUATION_ACKNOWLEDGEMENT,
+        ANSWERS,
+        lambda answer: (answer.id, answer.received.sec, answer.received.nanosec),
+    )
+    yield
+    echoing = False
+
+
 def fuzzed_topics(
     settings: SimulationSettings, calibration: Path, rounds: int, seed: int, work: Path
 ) -> Iterator[Figure]:
     """Of a whole closed loop with recorder and monitor: on every topic that any of its nodes subscribes to,
-    ``rounds`` messages of fields that nobody expects, and as many that are no messages. Then the loop must
-    still reach a target."""
+    ``rounds`` messages of fields that nobody expects, and as many that are no messages. All but the recorder,
+    which takes bytes as they are, must count what they refuse, and the loop must still reach a target; also
+    before, while every pose and acknowledgement comes again and late."""
     rng = random.Random(seed)
     nodes = chain(
         commanded(**settings.to_dict()),
@@ -201,23 +247,39 @@ def fuzzed_topics(
             return next((k for k in range(1, _MOST_TRIES) if go(target)), _MOST_TRIES)
 
         calm = tries(0.3)
-        attacked = {
-            (topic, kinds[0])
-            for name in names
-            for topic, kinds in bystander.subscriptions(name)
-            if topic not in _NOT_OURS
-        }
-        sent = 0
-        for topic, typename in sorted(attacked):
+        with _again_and_late(bystander):
+            disturbed = tries(0.6)
+        attacked: dict[tuple[str, str], list[str]] = defaultdict(list)  # who subscribes, by topic and type
+        for name in names:
+            for topic, kinds in bystander.subscriptions(name):
+                if topic not in _NOT_OURS:
+                    attacked[topic, kinds[0]].append(name)
+        answers: list[ActuationAcknowledgement] = []
+        bystander.listen(ActuationAcknowledgement, topics.ACTUATION_ACKNOWLEDGEMENT, answers.append, ANSWERS)
+
+        def refusals() -> dict[str, int]:
+            """By node, once they have dealt with everything; a drive tells it to who commands it."""
+            counts = {name: of.get("refused", 0) for name, of in bystander.counts_settled(*names).items()}
+            by_drive = sum(answer.status == ActuationAcknowledgement.STATUS_REFUSED for answer in answers)
+            return {**counts, "frame_source": by_drive}
+
+        sent, before = 0, refusals()
+        refused: dict[tuple[str, str], int] = {}
+        for (topic, typename), listeners in sorted(attacked.items()):
             package, _, name = typename.split("/")
             kind = getattr(importlib.import_module(f"{package}.msg"), name)
-            publisher = bystander.publisher(kind, topic)
+            publisher = bystander.publisher(kind, topic, bystander.node.count_subscribers(topic))
             for _ in range(rounds):
-                for message in (broken.fuzzed(kind, rng), *broken.garbage(kind, rng)):
+                wrong = (message for message in broken.REFUSABLE if isinstance(message, kind))
+                for message in (broken.fuzzed(kind, rng), *broken.garbage(kind, rng), *wrong):
                     with contextlib.suppress(RCLError):  # longer than any message of a fixed size
                         publisher.publish(message)
                         sent += 1
                 time.sleep(0.02)  # those who keep the last ten see them all
+            now = refusals()
+            relative = topic.removeprefix(f"/{bystander.namespace}/")
+            refused |= {(name, relative): now[name] - before[name] for name in listeners}
+            before = now
         bystander.call(Trigger, "controller/stop")
         bystander.call(Trigger, "pose_estimator/reset")
         after = tries(0.3)
@@ -228,7 +290,13 @@ def fuzzed_topics(
     yield exactly("nodes that ended", len(ended), 0)
     yield exactly("nodes that still report", len(counted), len(names))
     yield information("messages refused", sum(counts.get("refused", 0) for counts in counted.values()))
+    for (name, topic), count in refused.items():
+        if name != "recorder" and (name, topic) != _REFUSED_ELSEWHERE:
+            yield at_least(f"{name}: refused on {topic}", count, 1)
     yield exactly("targets sent until one was reached, before", calm, 1)
+    # A late pose across a change of the reference stops the controller, which is safe, and once.
+    what = "targets sent until one was reached, while poses and answers come again and late"
+    yield at_most(what, disturbed, _MOST_TRIES - 1)
     yield at_most("targets sent until one was reached, after", after, _MOST_TRIES - 1)
     with (work / "bag" / "bag_0.mcap").open("rb") as stream:
         recorded = sum(1 for _ in make_reader(stream).iter_messages())

@@ -7,6 +7,7 @@ somebody beside them counts frames and poses.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import threading
@@ -177,13 +178,33 @@ def _outage(seen: Witness, system: RunningSystem, victim: str) -> Iterator[Figur
     silence = float(np.diff([pose.at for pose in seen.poses[poses - 1 :]]).max())
     yield information(f"{victim} killed: longest time without a pose, s", silence)
     if victim == "frame_source":
-        return  # its frames begin anew
+        yield from _begun_anew(seen, poses)
+        return
     counters = [pose.counter for pose in seen.poses[poses - 1 :]]
     heard = {frame.counter for frame in seen.frames if counters[0] < frame.counter < counters[-1]}
     missing, told = len(heard - set(counters)), sum(np.diff(counters) - 1)
     yield exactly(f"{victim} killed: missing poses that frame_counter does not tell", missing - told, 0)
     if not measures:
         yield exactly(f"{victim} killed: frames without a pose", missing, 0)
+
+
+def _begun_anew(seen: Witness, poses: int) -> Iterator[Figure]:
+    """Of frames that count from 0 again after so many ``poses``."""
+    last = seen.poses[poses - 1].counter
+    first = next(k for k, frame in enumerate(seen.frames) if k and frame.counter < seen.frames[k - 1].counter)
+    frames = seen.frames[first:]
+    begin = next(k for k, pose in enumerate(seen.poses) if k >= poses and pose.counter < last)
+    anew = seen.poses[begin:]
+    valid = next((pose for pose in anew if pose.valid), None)
+    late = valid.counter if valid else math.inf
+    yield at_most(
+        "frame_source killed: frames from its new first one to the first with a valid pose", late, 1
+    )
+    counters = {pose.counter for pose in anew}
+    heard = {frame.counter for frame in frames if frame.counter <= max(counters)}
+    yield exactly("frame_source killed: frames of the new one without a pose", len(heard - counters), 0)
+    waited = (anew[0].at - frames[0].at) * RATE
+    yield at_most("frame_source killed: from its new first frame to the first pose, cycles", waited, 1)
 
 
 def _invalid(poses: Sequence[_Seen]) -> int:

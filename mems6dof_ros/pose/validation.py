@@ -274,7 +274,7 @@ def nees_once_recentred(run: Run, cycles: int = 12) -> float:
 
 @dataclass(frozen=True)
 class Angles:
-    """Published angles of n cycles beside the true ones of the same body frame.
+    """Published angles of the n cycles after the first beside the true ones of the same body frame.
 
     ``not_finite``: numbers among them that are none; ``tilt`` (n,): true tilt over its standard deviation;
     ``alpha``, ``beta`` (n,): whether they are claimed to be determined; over their standard deviations,
@@ -303,26 +303,24 @@ def angles(play_tilt: float, seed: int, cycles: int) -> Angles:
     for _ in range(cycles):
         gear.advance()
         run.update(estimator, gear, *gear.observe())
-    comparison = run.comparison()
-    not_finite, published, true = 0, [], []
-    for pose, truth, error in zip(run.poses, run.truths, comparison.error, strict=True):
-        numbers = np.r_[list(vars(pose.angles).values()), pose.displacement]
-        not_finite += int((~np.isfinite(numbers)).sum())
+    numbers = np.array([[*vars(pose.angles).values(), *pose.displacement] for pose in run.poses])
+    valid = [(pose, truth) for pose, truth in zip(run.poses, run.truths, strict=True) if pose.valid]
+    true = []
+    for (pose, truth), error in zip(valid, run.comparison().error, strict=True):
         tilt_x, tilt_y, psi = swing_twist(exp_so3(-error[3:]) @ pose.rotation)
         true.append((tilt_x, tilt_y, unwrap_near(psi, truth.psi - run.truths[0].psi)))
-        published.append(pose.displacement[3:])
-    tilt, published_psi = np.array(true)[1:, :2], np.array(published)[:, 2]
-    covariance = np.array([pose.displacement_covariance[3:5, 3:5] for pose in run.poses[1:]])
-    claims = [pose.angles for pose in run.poses[1:]]
+    psi_error = np.array([pose.displacement[5] for pose, _ in valid]) - np.array(true)[:, 2]
+    tilt, later = np.array(true)[1:, :2], [pose for pose, _ in valid[1:]]
+    covariance = np.array([pose.displacement_covariance[3:5, 3:5] for pose in later])
+    claims = [pose.angles for pose in later]
     off = np.array([claim.alpha for claim in claims]) - np.arctan2(-tilt[:, 0], tilt[:, 1])
-    sd_step = np.sqrt([pose.increment_covariance[5, 5] for pose in run.poses[1:]])
     return Angles(
-        not_finite,
+        int((~np.isfinite(numbers)).sum()),
         np.sqrt(np.einsum("ni,nij,nj->n", tilt, np.linalg.inv(covariance), tilt)),
         np.array([claim.alpha_valid for claim in claims]),
         np.array([claim.beta_valid for claim in claims]),
         (off - math.tau * np.round(off / math.tau)) / [claim.sd_alpha for claim in claims],
-        np.diff(published_psi - np.array(true)[:, 2]) / sd_step,
+        np.diff(psi_error) / np.sqrt([pose.increment_covariance[5, 5] for pose in later]),
     )
 
 

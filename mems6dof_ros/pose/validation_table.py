@@ -141,7 +141,7 @@ def _clutter(seeds: Sequence[int]) -> list[Figure]:
         if fraction < 0.3:
             rows.append(between(f"{what}: NEES/6", nees, 0.8, 1.3))
         else:
-            # So many false neighbours raise the residuals that tell the noise: the claim is too modest.
+            # Honest or too modest: standard deviations are claimed some 13 % too large.
             rows.append(information(f"{what}: NEES/6", nees))
         rows.append(at_most(f"{what}: wrong poses", sum(run.wrong_poses for run in runs), 0))
         rows.append(at_most(f"{what}: cycles lost", sum(run.lost for run in runs), 0))

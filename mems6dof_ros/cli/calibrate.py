@@ -44,7 +44,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     fit.add_argument(
         "--method",
         help="method that the file proposes: joint (default: fast enough to be live), psf (the most precise,"
-        " 25 times slower) or rho_amp (the paper's)",
+        " some 40 times slower) or rho_amp (the paper's)",
     )
     parser.set_defaults(run=run)
 

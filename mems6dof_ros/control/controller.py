@@ -127,7 +127,10 @@ class Controller:
 
     def on_pose(self, pose: CyclePose, now: float) -> Decision | None:
         """A pose has arrived."""
-        before, self._pose = self._pose, pose
+        before = self._pose
+        if before and pose.stamp_ns < before.stamp_ns <= now * 1e9:
+            return None  # late: what is known is newer, unless time itself has gone back
+        self._pose = pose
         if self.state is not State.MOVING:
             return None
         if self._awaited and pose.stamp_ns * 1e-9 < self._awaited.sent:

@@ -930,8 +930,8 @@ def close_pairs(positions: Array, distance: float) -> NDArray[np.int64]:
 
 @njit(**_OPTIONS)
 def nearest(positions: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Distance (n,) in the plane from each of ``positions`` (n, 2 or 3) to the nearest of ``others`` (m, 2 or 3),
-    and which that is, -1 for none.
+    """Distance (n,) in the plane from each of ``positions`` (n, 2 or 3) to the nearest of ``others`` (m, 2 or
+    3), and which that is, -1 for none.
 
     By trying all: for hundreds a third of the time of a tree, which is mostly its building.
     """

@@ -177,6 +177,17 @@ def test_a_stop_holds_until_the_next_target(controller):
     assert (controller.state, controller.reason) == (State.MOVING, "")
 
 
+def test_a_pose_that_comes_late_is_not_the_latest(controller):
+    controller.set_target(9.0, NOW)
+    controller.on_acknowledgement(done(1, 1), NOW)
+    assert controller.on_pose(pose(1, 0.1, reference_version=3), NOW).command.motion == FORWARD
+    assert controller.on_pose(pose(0, 0.0, at=NOW - 0.01, reference_version=2), NOW) is None
+    controller.on_acknowledgement(done(2, 2), NOW)
+    step = np.array([0, 0, 0, 0, 0, 0.1])
+    following = pose(2, 0.2, at=NOW + 0.01, reference_version=3, increment=step, increment_cycles=1)
+    assert controller.on_pose(following, NOW + 0.01).command.motion == FORWARD
+
+
 def test_a_recentred_origin_changes_nothing_and_another_zero_of_psi_stops(controller):
     controller.set_target(9.0, NOW)
     controller.on_acknowledgement(done(1, 1), NOW)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 
 # From malloc.h of the GNU C library.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MOST_ARENAS = -1, -3, -8
 #: The greatest that the library accepts, bytes.
 _LARGEST_BLOCK = 32 << 20
 #: Free memory that is kept, bytes.
@@ -25,3 +25,4 @@ def keep_memory() -> None:
         return
     mallopt(_MMAP_THRESHOLD, _LARGEST_BLOCK)
     mallopt(_TRIM_THRESHOLD, _KEPT)
+    mallopt(_MOST_ARENAS, 1)  # those of other threads than the first return memory all the same

@@ -43,7 +43,6 @@ class ListenerNode(InstrumentNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
-    transport.keep_large_buffers()
     return run(ListenerNode, args)
 
 

@@ -35,7 +35,7 @@ def request_calibration(
     transport.use_profile(frames=False)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C belongs to the program
     node = rclpy.create_node(f"calibration_client_{os.getpid()}", namespace=namespace)
-    client = ActionClient(node, Calibrate, CALIBRATE)
+    client = ActionClient(node, Calibrate, CALIBRATE, feedback_sub_qos_profile=transport.MESSAGES)
     try:
         executor = SingleThreadedExecutor()
         executor.add_node(node)

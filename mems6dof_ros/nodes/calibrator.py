@@ -100,6 +100,7 @@ class CalibratorNode(InstrumentNode):
             self._execute,
             goal_callback=self._on_goal,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
+            feedback_pub_qos_profile=transport.MESSAGES,  # planes are fitted faster than they are heard of
         )
         self.tell("ready")
 
@@ -367,7 +368,6 @@ def _new_directory(path: Path) -> Path:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
-    transport.keep_large_buffers()
     return run(CalibratorNode, args)
 
 

@@ -516,7 +516,6 @@ class FrameSourceNode(InstrumentNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
-    transport.keep_large_buffers()
     return run(FrameSourceNode, args, frames=True)
 
 

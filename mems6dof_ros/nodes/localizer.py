@@ -448,7 +448,6 @@ def nothing_found(
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
-    transport.keep_large_buffers()
     cv2.setNumThreads(1)  # the other cores have processes of their own
     return run(LocalizerNode, args)
 

@@ -16,7 +16,7 @@ import cv2
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.localization.localizations import Latency
-from mems6dof_ros.nodes import frame_source, localizer, pose_estimator, transport
+from mems6dof_ros.nodes import frame_source, localizer, pose_estimator
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, run
 from mems6dof_ros.nodes.parameters import Parameter
 from mems6dof_ros.recording import topics
@@ -95,7 +95,6 @@ class PipelineNode(frame_source.FrameSourceNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
-    transport.keep_large_buffers()
     cv2.setNumThreads(1)  # the other cores have processes of their own
     return run(PipelineNode, args, frames=True)
 

@@ -7,7 +7,6 @@ for frames; only processes that publish frames pay for the large one.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
 import struct
@@ -108,15 +107,3 @@ def deserialize(data: bytes, kind: type) -> Any:
         return deserialize_message(data, kind)
     except RuntimeError as error:
         raise InputError(kind.__name__, f"{len(data)} bytes that are none", "a serialized message") from error
-
-
-def keep_large_buffers() -> None:
-    """Let glibc reuse the memory of frames instead of returning it to the kernel after each."""
-    trim_threshold, mmap_threshold, most_arenas = -1, -3, -8  # malloc.h
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # another C library
-        return
-    mallopt(mmap_threshold, 32 * _MEBIBYTE)  # the greatest it accepts
-    mallopt(trim_threshold, 512 * _MEBIBYTE)
-    mallopt(most_arenas, 1)  # those of other threads than the first return memory all the same

@@ -120,7 +120,6 @@ def main() -> int:
     what, first, second, *arguments = sys.argv[1:]
     if what == "recorder":
         return run_witnessed_recorder(Journal(Path(first)), float(second), arguments)
-    transport.keep_large_buffers()
     return run(lambda: TrafficNode(float(first), int(second)), arguments, frames=True)
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import check_image
 from mems6dof_ros.localization import detection_kernels
-from mems6dof_ros.localization.kernels import close_pairs, pixels
+from mems6dof_ros.localization.kernels import pixels
+from mems6dof_ros.localization.neighbours import close_pairs
 
 Cells: TypeAlias = NDArray[np.float32]
 

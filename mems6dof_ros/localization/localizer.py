@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from mems6dof_ros.calibration.interface import OpticalCalibration, Positions
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
-from mems6dof_ros.localization import kernels
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.detection import DetectionSettings, detect
 from mems6dof_ros.localization.fitting import DEFAULT_WEIGHTING, check_fit, fit_gaussians
 from mems6dof_ros.localization.localizations import Flag, GaussianFits, Localizations
+from mems6dof_ros.localization.neighbours import close_pairs
 
 _GATES = ("least_significance", "most_sigma", "most_misfit")
 
@@ -168,7 +168,7 @@ def _again(fits: GaussianFits, distance_px: float) -> NDArray[np.bool_]:
     """Fits that have wandered to a particle that an earlier candidate found."""
     again = np.zeros(len(fits), dtype=bool)
     good = np.nonzero((fits.flags & Flag.FIT_FAILED) == 0)[0]
-    for a, b in kernels.close_pairs(fits.parameters[good, :2], distance_px):
+    for a, b in close_pairs(fits.parameters[good, :2], distance_px):
         if not again[good[a]]:
             again[good[b]] = True
     return again
@@ -178,7 +178,7 @@ def _disturbed(fits: GaussianFits, distance_px: float, least_flux: float) -> NDA
     """Fits with a neighbour within ``distance_px`` that has at least ``least_flux`` of their light."""
     disturbed = np.zeros(len(fits), dtype=bool)
     good = np.nonzero((fits.flags & Flag.FIT_FAILED) == 0)[0]
-    pairs = kernels.close_pairs(fits.parameters[good, :2], distance_px)
+    pairs = close_pairs(fits.parameters[good, :2], distance_px)
     a, b = good[pairs[:, 0]], good[pairs[:, 1]]
     flux = fits.flux
     disturbed[a[flux[b] > least_flux * flux[a]]] = True

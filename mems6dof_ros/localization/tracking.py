@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import Frame
-from mems6dof_ros.localization import kernels
 from mems6dof_ros.localization.detection import detect
 from mems6dof_ros.localization.localizations import Flag, Localizations
 from mems6dof_ros.localization.localizer import Localizer
+from mems6dof_ros.localization.neighbours import nearest
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -111,7 +111,7 @@ class TrackingLocalizer:
         pixel_size = self.localizer.check(frame)
         place = (detect(frame.image, self.localizer.settings.detection) + 0.5) * pixel_size - half_field
         known = found.position[np.isfinite(found.position[:, :2]).all(axis=1), :2]
-        place = place[kernels.nearest(place, known)[0] > _SAME]
+        place = place[nearest(place, known)[0] > _SAME]
         self._newcomers = frame.cycle, place
         for motion in self._motions:
             self._welcome(motion)
@@ -144,9 +144,9 @@ class TrackingLocalizer:
         place = (position - transform[:3, 3]) @ transform[:3, :3]
         seen, fresh = np.empty(0, np.int64), np.ones(len(place), bool)
         if len(self._places) and len(place):
-            distance, nearest = kernels.nearest(place, self._places)
+            distance, which = nearest(place, self._places)
             fresh = distance > _SAME
-            seen = nearest[~fresh]
+            seen = which[~fresh]
             self._places[seen], self._trusted[seen] = place[~fresh], good[~fresh]
         inside = (np.abs(_moved(self._places, transform)) < half_field).all(axis=1)
         self._misses[inside] += 1

@@ -11,8 +11,8 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.localization.camera import CameraNoise
 from mems6dof_ros.localization.fitting import KAPPA, WEIGHTINGS, fit_gaussians
 from mems6dof_ros.localization.gaussian import cramer_rao, gaussian, pixel_grid, reference_fit, window_weights
-from mems6dof_ros.localization.kernels import close_pairs, nearest
 from mems6dof_ros.localization.localizations import Flag, GaussianFits
+from mems6dof_ros.localization.neighbours import close_pairs, nearest
 from mems6dof_ros.localization.validation import matched_field, physical_field
 
 PERFECT = CameraNoise(0.0, 1.0, 0.0, 65535)

@@ -247,7 +247,8 @@ class FrameSourceNode(InstrumentNode):
         size = info.width * info.height * np.dtype(messages.PIXEL_TYPES[info.encoding]).itemsize
         topic = self._topics[topics.FRAME_INFO].topic_name
         try:
-            return FrameRing(ring_path(topic, self.context.get_domain_id()), size)
+            path = ring_path(topic, self.context.get_domain_id())
+            return FrameRing(path, size, waits_for_readers=self.values["pacing"] == "consumer")
         except OSError as error:
             self.get_logger().info(f"frames go by the topic alone: {error}")
             return None

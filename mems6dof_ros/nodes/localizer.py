@@ -39,17 +39,17 @@ from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, InstrumentNode, run
 from mems6dof_ros.nodes.frame_matcher import ArrivedFrame, FrameMatcher
 from mems6dof_ros.nodes.frame_order import Arrival, FrameOrder
+from mems6dof_ros.nodes.image_route import ImageRoute
 from mems6dof_ros.nodes.parameters import Parameter, of_settings, to_settings
-from mems6dof_ros.nodes.shared_frames import SLOTS, SharedFrames, SharedImage, ring_path
+from mems6dof_ros.nodes.shared_frames import SLOTS, SharedImage
 from mems6dof_ros.nodes.sim_time import on_jump_back
 from mems6dof_ros.pose.cycle_pose import CyclePose
 from mems6dof_ros.recording import messages, topics
 
 POINTS = "localizations/points"
 
-#: Shared frames in a row, each within so many seconds of the one before, upon which the topic is left; and
-#: without an info for that time it is subscribed to again, since somebody else may publish there.
-_SHARED_IN_A_ROW, _SOON = 3, 1.0
+#: Seconds after which it is looked for a camera that offers less than we ask for.
+_LOOK_FOR_CAMERAS = 1.0
 
 _DETECTION = {
     "binning": ("px", "Side of one cell of the image that detection works on."),
@@ -181,16 +181,13 @@ class LocalizerNode(InstrumentNode):
         messages.deserialize(serialize_message(Image()), "sensor_msgs/msg/Image")  # the first takes 0.1 s
 
     def _subscribe(self) -> None:
-        info_topic = self.resolve_topic_name(topics.FRAME_INFO)
-        self._shared = SharedFrames(ring_path(info_topic, self.context.get_domain_id()))
-        self._shared.attend()
         stream = self.make_stream(self._on_tick)
         if self._output.tracker:
             stream.subscribe(Pose6DOF, topics.POSE_6DOF, self._on_pose)
         stream.subscribe(FrameInfo, topics.FRAME_INFO, self._on_info)
         self._subscribe_to_images()
-        self._in_a_row, self._informed_at = 0, -math.inf
-        self.health.gauge("images by", lambda: "topic" if self._by_topic else "shared memory")
+        self._route = ImageRoute(self, self._subscribe_to_images, lambda: stream.unsubscribe(topics.IMAGE))
+        self.health.gauge("images by", lambda: self._route.way)
         stream.begin()
         self.tell("ready")
 
@@ -198,7 +195,7 @@ class LocalizerNode(InstrumentNode):
         assert self.stream is not None
         self._quality = transport.for_images(self, topics.IMAGE)
         self.stream.subscribe(Image, topics.IMAGE, self._on_image, self._quality, raw=True)
-        self._by_topic, self._looked_at = True, time.monotonic()
+        self._looked_at = time.monotonic()
 
     def _look_for_cameras(self) -> None:
         """Subscribe anew where somebody publishes images who offers less than we ask for."""
@@ -210,25 +207,11 @@ class LocalizerNode(InstrumentNode):
 
     def _on_info(self, info: FrameInfo) -> None:
         stamp_ns = messages.nanoseconds(info.header.stamp)
-        self._shared.attend()
-        image = self._shared.find(info.header, stamp_ns)
-        if image or self._by_topic:
+        image = self._route.find(info.header, stamp_ns)
+        if image or self._route.by_topic:
             self._matcher.add_info(stamp_ns, info, image, time.time_ns())
-        self._choose(stamp_ns, image is not None)
+        self._route.choose(stamp_ns, image is not None, settled=not self._matcher.lacks_image)
         self._forward()
-
-    def _choose(self, stamp_ns: int, shared: bool) -> None:
-        """Subscribe to the images, or no more, upon an info whose frame is ``shared`` or not; one that
-        came too late for its frame says nothing."""
-        assert self.stream is not None
-        soon = time.monotonic() - self._informed_at < _SOON
-        self._informed_at = time.monotonic()
-        self._in_a_row = self._in_a_row + 1 if shared and soon else 0
-        if self._by_topic and self._in_a_row >= _SHARED_IN_A_ROW and not self._matcher.lacks_image:
-            self.stream.unsubscribe(topics.IMAGE)
-            self._by_topic = False
-        elif not (self._by_topic or shared or self._shared.overtaken(stamp_ns)):
-            self._subscribe_to_images()
 
     def _on_image(self, data: bytes) -> None:
         arrival_ns = time.time_ns()
@@ -248,10 +231,8 @@ class LocalizerNode(InstrumentNode):
 
     def _on_tick(self) -> None:
         self._matcher.tick()
-        self._shared.attend()
-        if not self._by_topic and time.monotonic() - self._informed_at > _SOON:
-            self._subscribe_to_images()
-        if self._by_topic and time.monotonic() - self._looked_at > _SOON:
+        self._route.tick()
+        if self._route.by_topic and time.monotonic() - self._looked_at > _LOOK_FOR_CAMERAS:
             self._look_for_cameras()
         self._forward()
 

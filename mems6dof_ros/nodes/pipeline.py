@@ -26,7 +26,7 @@ def _parameters() -> tuple[Parameter, ...]:
     by_name: dict[str, Parameter] = {}
     for parameter in (*frame_source.PARAMETERS, *localizer.PARAMETERS, *pose_estimator.PARAMETERS):
         by_name.setdefault(parameter.name, parameter)
-    between_nodes = ("window", "acknowledged_by", "acknowledge_timeout", "share_frames")
+    between_nodes = ("window", "acknowledged_by", "acknowledge_timeout")
     for name in (*(p.name for p in QUEUE_PARAMETERS), *between_nodes):
         del by_name[name]
     by_name["pacing"] = replace(

@@ -29,11 +29,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from mems6dof_msgs.msg import FrameInfo
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import InstrumentNode, run
 from mems6dof_ros.nodes.parameter_files import ParameterReader, parameter_file
 from mems6dof_ros.nodes.parameters import START_PAUSED, Parameter
+from mems6dof_ros.nodes.recorded_images import RecordedImages
 from mems6dof_ros.nodes.worker import DRAIN_TIMEOUT
 from mems6dof_ros.recording import topics
 from mems6dof_ros.recording.bag import COMPRESSIONS, BagWriter, Channel, Qos
@@ -126,7 +128,7 @@ PARAMETERS = (
 
 class _Received(NamedTuple):
     channel: Channel
-    data: bytes
+    data: bytes | memoryview
     log_ns: int
     publish_ns: int
     sequence: int
@@ -171,7 +173,8 @@ class RecorderNode(InstrumentNode):
         self.start_worker(lambda act: act(), capacity)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._channels: list[Channel] = []
-        self._stream = self.make_stream(tick=self._look_for_types)
+        self._images: RecordedImages | None = None  # of the topic that may be left for shared memory
+        self._stream = self.make_stream(tick=self._on_tick)
         self._unknown = [name for name in self.values["topics"] if not self._subscribe_known(name)]
         self._stream.begin()
         self.create_timer(1.0, self._on_second, clock=steady)
@@ -203,10 +206,14 @@ class RecorderNode(InstrumentNode):
         self._subscribe(name, KNOWN_TYPES[name], transport.MESSAGES)
         return True
 
+    def _on_tick(self) -> None:
+        if self._images:
+            self._images.tick()
+        if self._unknown:
+            self._look_for_types()
+
     def _look_for_types(self) -> None:
         """Subscribe to what has appeared, in the way it is published."""
-        if not self._unknown:
-            return
         types = dict(self.get_topic_names_and_types())
         for name in list(self._unknown):
             resolved = self.resolve_topic_name(name)
@@ -241,9 +248,37 @@ class RecorderNode(InstrumentNode):
         channel = Channel(self.resolve_topic_name(name), typename, (offered,))
         self._channels.append(channel)
         receive = functools.partial(self._on_message, channel)
-        self._stream.subscribe(message_type, name, receive, qos, raw=True, informed=True)
+        if name == topics.FRAME_INFO:
+            receive = functools.partial(self._on_info, channel)
+        if name == topics.IMAGE and typename == _IMAGE:
+            self._subscribe_to_images(channel, message_type, qos)
+        else:
+            self._stream.subscribe(message_type, name, receive, qos, raw=True, informed=True)
 
-    def _on_message(self, channel: Channel, data: bytes, info: dict[str, Any]) -> None:
+    def _subscribe_to_images(self, channel: Channel, message_type: type, qos: QoSProfile) -> None:
+        """... which may come by shared memory, as the infos tell."""
+
+        def subscribe() -> None:
+            self._sequences.pop(channel.topic, None)
+            self._stream.subscribe(message_type, topics.IMAGE, images.on_image, qos, raw=True, informed=True)
+
+        images = self._images = RecordedImages(
+            self,
+            subscribe,
+            functools.partial(self._stream.unsubscribe, topics.IMAGE),
+            functools.partial(self._on_message, channel),
+            self.health.lost,
+        )
+        subscribe()
+        if topics.FRAME_INFO not in self.values["topics"]:
+            self._stream.subscribe(FrameInfo, topics.FRAME_INFO, images.on_info, raw=True, informed=True)
+
+    def _on_info(self, channel: Channel, data: bytes, info: dict[str, Any]) -> None:
+        self._on_message(channel, data, info)
+        if self._images:
+            self._images.on_info(data, info)
+
+    def _on_message(self, channel: Channel, data: bytes | memoryview, info: dict[str, Any]) -> None:
         assert self.worker is not None
         with self._handing_over:
             bag = self._bag

@@ -34,8 +34,16 @@ _MOST, _LEAVE = 512 << 20, 64 << 20
 _ATTENTION = 2.0
 
 _PAGE = 4096
-_MAGIC = int.from_bytes(b"mems6dF1", "little")
-_HEAD = np.dtype([("magic", "<u8"), ("slots", "<u8"), ("slot_size", "<u8"), ("attention", "<f8")])
+_MAGIC = int.from_bytes(b"mems6dF2", "little")
+_HEAD = np.dtype(
+    [
+        ("magic", "<u8"),
+        ("slots", "<u8"),
+        ("slot_size", "<u8"),
+        ("waits_for_readers", "<u8"),
+        ("attention", "<f8"),
+    ]
+)
 #: ``serial`` 0: being written.
 _SLOT = np.dtype(
     [("serial", "<u8"), ("stamp_ns", "<i8"), ("height", "<u4"), ("width", "<u4"), ("itemsize", "<u4")]
@@ -74,9 +82,10 @@ class FrameRing:
     """The writer's side; ``close`` removes the file. Raises OSError where there is no room for it.
 
     ``frame_size``: bytes of pixels. Another ring at ``path``, of a source that is gone, is replaced.
+    ``waits_for_readers``: what it says of its source, of whom a reader of memory gets no such consideration.
     """
 
-    def __init__(self, path: Path, frame_size: int) -> None:
+    def __init__(self, path: Path, frame_size: int, waits_for_readers: bool = False) -> None:
         slot_size = _PAGE + -(-frame_size // _PAGE) * _PAGE
         size = _PAGE + SLOTS * slot_size
         free = os.statvfs(path.parent).f_bavail * os.statvfs(path.parent).f_frsize
@@ -89,7 +98,7 @@ class FrameRing:
         os.posix_fallocate(self._file, 0, size)  # rather an error now than SIGBUS with a frame
         self._inode = os.fstat(self._file).st_ino
         memory = mmap.mmap(self._file, size)
-        np.frombuffer(memory, _HEAD, 1)[0] = (_MAGIC, SLOTS, slot_size, -1e9)
+        np.frombuffer(memory, _HEAD, 1)[0] = (_MAGIC, SLOTS, slot_size, waits_for_readers, -1e9)
         self._ring = _Ring(memory)
         self._headers = self._ring.slots()
         self._serial = 0
@@ -154,7 +163,12 @@ class SharedFrames:
         self._inode = 0
         self._ring: _Ring | None = None
 
-    def attend(self) -> None:
+    @property
+    def waits_for_readers(self) -> bool:
+        """The source waits until who reads its topics has every frame."""
+        return bool(self._ring and self._ring.head["waits_for_readers"])
+
+    def attend(self, wanted: bool = True) -> None:
         """Look whether there is a ring, and ask that frames are written; to be called now and then."""
         try:
             inode = self._path.stat().st_ino
@@ -164,7 +178,7 @@ class SharedFrames:
         if inode != self._inode:
             self._ring = _opened(self._path)
             self._inode = inode if self._ring else 0  # one that is just being made, look again
-        if self._ring:
+        if self._ring and wanted:
             self._ring.head["attention"] = time.monotonic()
 
     def find(self, header: Any, stamp_ns: int) -> SharedImage | None:

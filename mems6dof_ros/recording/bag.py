@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, cast
 
 import yaml
 from mcap.reader import McapReader, make_reader
@@ -28,6 +28,7 @@ from mems6dof_ros import __version__
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording import read_ahead
 from mems6dof_ros.recording.definitions import PACKAGE, definition, named_types, typestore
+from mems6dof_ros.recording.direct_file import DirectFile
 from mems6dof_ros.recording.messages import Message, serialize
 from mems6dof_ros.recording.metadata import (
     PROVENANCE,
@@ -137,8 +138,10 @@ class BagWriter:
         publish_time_ns: int | None = None,
         sequence: int = 0,
     ) -> None:
-        """Append one CDR message: received at ``log_time_ns``, sent at ``publish_time_ns``."""
-        message = _Message(bytes(data), log_time_ns, publish_time_ns or log_time_ns, sequence)
+        """Append one CDR message: received at ``log_time_ns``, sent at ``publish_time_ns``.
+
+        ``data`` must not change any more."""
+        message = _Message(data, log_time_ns, publish_time_ns or log_time_ns, sequence)
         with self._saving_what_is_whole():
             if self._file.closed:
                 self._begin_next_file(log_time_ns)
@@ -236,7 +239,7 @@ class BagWriter:
 
 
 class _Message(NamedTuple):
-    data: bytes
+    data: bytes | memoryview
     log_ns: int
     publish_ns: int
     sequence: int
@@ -254,10 +257,12 @@ class _File:
         self._schemas: dict[str, int] = {}
         self._provenance = provenance
         self._synced = time.monotonic()
-        self._stream = path.open("xb")
-        hold(self._stream)
+        self._stream = DirectFile(path)
+        hold(self._stream.fileno())
         # The library also writes offsets to groups of the summary that are empty, which validators refuse.
-        self._writer = Writer(self._stream, compression=compression, use_summary_offsets=False)
+        self._writer = Writer(
+            cast("IO[bytes]", self._stream), compression=compression, use_summary_offsets=False
+        )
         try:
             self._writer.start(profile="ros2", library=f"mems6dof_ros {__version__}")
             self._writer.add_metadata(PROVENANCE, dict(provenance))
@@ -298,7 +303,7 @@ class _File:
 
     def write(self, channel: Channel, message: _Message) -> None:
         data, log_ns, publish_ns, sequence = message
-        self._writer.add_message(self._ids[channel], log_ns, data, publish_ns, sequence)
+        self._writer.add_message(self._ids[channel], log_ns, cast(bytes, data), publish_ns, sequence)
         self.counts[channel] += 1
         self.start_ns = log_ns if self.start_ns is None else min(self.start_ns, log_ns)
         self.end_ns = log_ns if self.end_ns is None else max(self.end_ns, log_ns)
@@ -310,7 +315,7 @@ class _File:
     def flush(self, sync_period: float) -> None:
         self._writer.flush()
         if time.monotonic() - self._synced >= sync_period:
-            os.fsync(self._stream.fileno())
+            self._stream.sync()
             self._synced = time.monotonic()
 
     def abandon(self) -> None:
@@ -326,8 +331,7 @@ class _File:
         text = metadata_text([self.summary()], self._provenance)
         self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
         self._writer.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
+        self._stream.sync()
         self._stream.close()
 
 

@@ -15,7 +15,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import yaml
 from mcap import records
@@ -99,13 +99,13 @@ def interrupted(path: Path) -> bool:
     return bool(incomplete) and not any(map(being_written, incomplete))
 
 
-def hold(stream: IO[bytes]) -> bool:
+def hold(descriptor: int) -> bool:
     """Lock a file until it is closed, so that it is known to be written to; False where somebody else has.
 
     A file system without locks lets everybody.
     """
     try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:
@@ -116,7 +116,7 @@ def hold(stream: IO[bytes]) -> bool:
 def being_written(file: Path) -> bool:
     """Has somebody a hold of it? False where it cannot be read."""
     with contextlib.suppress(OSError), file.open("rb") as stream:
-        return not hold(stream)
+        return not hold(stream.fileno())
     return False
 
 
@@ -161,7 +161,7 @@ def complete_file(path: Path) -> Completed:
     """Complete one .mcap file; InputError where it is none or being written, or cannot be read or changed."""
     try:
         with path.open("r+b") as stream:
-            if not hold(stream):
+            if not hold(stream.fileno()):
                 raise InputError(str(path), "a file that is being written", "one whose writer has ended")
             size = path.stat().st_size
             if not size:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from peers import SMALL_GEAR, NodeProcess, Peer
+from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
@@ -22,6 +23,7 @@ from mems6dof_ros.frame import Frame
 from mems6dof_ros.nodes.shared_frames import SLOTS, FrameRing, SharedFrames, ring_path
 from mems6dof_ros.nodes.shared_memory import FOLDER, remove_abandoned
 from mems6dof_ros.recording import messages
+from mems6dof_ros.recording.bag import BagReader
 from mems6dof_ros.simulation.experiment import motion_frames
 from mems6dof_ros.simulation.settings import SimulationSettings
 
@@ -151,14 +153,14 @@ def test_only_rings_of_dead_sources_are_removed(path: Path) -> None:
 # Live -----------------------------------------------------------------------------------------------
 
 
-def by(peer: Peer, way: str) -> bool:
-    """The localizer says last that images come this ``way``."""
+def by(peer: Peer, way: str, node: str = "localizer") -> bool:
+    """The ``node`` says last that images come to it this ``way``."""
     said = [
         pair.value
         for array in peer.received["/diagnostics"]
         for status in array.status
         for pair in status.values
-        if pair.key == "images by"
+        if pair.key == "images by" and status.name.endswith(node)
     ]
     return bool(said) and said[-1] == way
 
@@ -194,6 +196,49 @@ def test_a_localizer_leaves_the_topic_and_comes_back(
     peer.wait(lambda: sum(message.header.stamp.sec > last + 5 for message in found) == 4)
     assert localizer.stop() == 0
     ring_path("/frame_info", domain, FOLDER).unlink()  # of the source that was killed
+
+
+@pytest.mark.parametrize("told", ["image_raw, frame_info", "image_raw"])
+def test_a_recorder_takes_each_frame_once(
+    start: Start, peer: Peer, domain: int, tmp_path: Path, told: str
+) -> None:
+    """Out of memory while the source sets the pace, and from the topic of who tells nothing of it."""
+    peer.listen(DiagnosticArray, "/diagnostics")
+    output = tmp_path / "bag"
+    recorder = start("recorder", "-p", f"topics:=[{told}]", "-p", f"output:={output}")
+    recorder.wait_for_line("active")
+    small = [word for name, value in SMALL_GEAR.items() for word in ("-p", f"simulator.{name}:={value}")]
+    source = start("frame_source", "-p", "rate:=40.0", "-p", "simulator.loop:=4", *small)
+    peer.wait(lambda: by(peer, "shared memory", "recorder"))
+    assert peer.node.count_subscribers("image_raw") == 0
+    seen = len(peer.received["/diagnostics"])
+    peer.wait(lambda: len(peer.received["/diagnostics"]) > seen + 3)  # seconds
+    assert source.stop() == 0
+    peer.wait(lambda: by(peer, "topic", "recorder"))
+    camera = peer.publisher(Image, "image_raw")
+    other = frame(10**9)
+    camera.publish(messages.to_rclpy(messages.image(other)))
+    assert camera.wait_for_all_acked(Duration(seconds=10.0))
+    assert recorder.stop() == 0
+
+    shots = [shot.image for shot in motion_frames(SimulationSettings(**SMALL_GEAR), 4)]
+    with BagReader(output) as bag:
+        assert set(bag.topics) == {f"/{name}" for name in told.split(", ")}
+        images = [found.message for found in bag.messages(["/image_raw"])]
+        infos = [found.message for found in bag.messages(["/frame_info"])]
+    stamps = [messages.nanoseconds(image.header.stamp) for image in images]
+    assert stamps.pop() == other.stamp_ns
+    assert np.array_equal(messages.to_frame(images.pop()).image, other.image)
+    assert len(images) > 60
+    assert stamps == sorted(set(stamps))
+    if infos:
+        told_of = [messages.nanoseconds(info.header.stamp) for info in infos]
+        assert stamps == told_of[told_of.index(stamps[0]) :]
+    first = next(k for k in range(4) if np.array_equal(messages.image_pixels(images[0]), shots[k]))
+    for number, image in enumerate(images, start=first):
+        back = messages.to_frame(image)
+        assert np.array_equal(back.image, shots[number % 4])
+        assert (back.frame_id, image.encoding, image.step) == ("microscope", "mono16", 2 * image.width)
 
 
 def test_a_camera_driver_that_promises_nothing_is_heard(start: Start, peer: Peer, calibration: str) -> None:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from mems6dof_ros.bench.table import Row
 from mems6dof_ros.errors import Mems6dofError
 from mems6dof_ros.recording import messages, topics
 from mems6dof_ros.recording.bag import BagReader
+from mems6dof_ros.recording.direct_file import DirectFile
 
 #: Motion cycles per second that the drive of the paper makes.
 DRIVE = 90.0
@@ -33,9 +34,8 @@ DRIVE = 90.0
 START = 240.0
 #: Growth, MiB per 10 000 cycles, above which 200 bytes of each cycle are kept; 600 cycles tell less.
 LEAK, LEAK_QUICK = 2.0, 50.0
-#: Of the disk's sequential rate, and of what the chain does without, that recorded frames may take: to copy,
-#: check and write one costs two cores about as much as to measure it.
-DISK_SHARE, CHAIN_SHARE = 0.8, 0.2
+#: Of the disk's own rate, that recorded frames take where it is what limits them.
+DISK_SHARE = 0.8
 #: Messages before the clocks run: the constellation is then known.
 WARM_UP = 4 * CYCLES
 
@@ -105,7 +105,7 @@ def recorder(material: Material) -> list[Row]:
     """What a recorder beside the chain takes of its rate, and whether it writes all frames too.
 
     At the drive's rate, or nine tenths of what the chain can do: beyond it whatever runs takes its share.
-    Frames at what the disk and the processors take.
+    Frames at that rate too, or at the disk's.
     """
     free = _chain(material, 0.0)
     rate = min(DRIVE, 0.9 * free.rate)
@@ -115,7 +115,7 @@ def recorder(material: Material) -> list[Row]:
     output = material.directory / "recorded_frames"
     size = 2e-6 * material.size**2
     disk = _disk_rate(material.directory)
-    with_frames = min(CHAIN_SHARE * free.rate, DISK_SHARE * disk / size)
+    with_frames = min(rate, DISK_SHARE * disk / size)
     frames = _chain(material, with_frames, output=output, images=True)
     gaps = _missing(output, topics.IMAGE)
     missing = _missing(material.directory / "recorded", topics.POSE_6DOF)
@@ -375,16 +375,16 @@ def _read(data: bytes, topic: str) -> tuple[float, int]:
     return spent * 1e-9, int(found.frame_counter)
 
 
-def _disk_rate(directory: Path, size_mb: int = 2000) -> float:
+def _disk_rate(directory: Path, size_mb: int = 4000) -> float:
     """MB/s of writing frames one after another, until they are on the disk; of less than a second's it may
     boast."""
     block = np.random.default_rng(0).integers(0, 255, 8_388_608, dtype=np.uint8).tobytes()
-    path = directory / "disk"
+    file = DirectFile(directory / "disk")
     begin = time.monotonic()
-    with path.open("wb") as stream:
-        written: Sequence[int] = [stream.write(block) for _ in range(max(size_mb * 10**6 // len(block), 1))]
-        stream.flush()
-        os.fsync(stream.fileno())
-    seconds = time.monotonic() - begin
-    path.unlink()
-    return sum(written) / 1e6 / seconds
+    while file.tell() < size_mb * 10**6:
+        file.write(block)
+    file.sync()
+    rate = file.tell() / 1e6 / (time.monotonic() - begin)
+    file.close()
+    (directory / "disk").unlink()
+    return rate

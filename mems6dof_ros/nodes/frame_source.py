@@ -32,10 +32,9 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
-from mems6dof_msgs.msg import FrameInfo, GroundTruth, Localizations, Pose6DOF
+from mems6dof_msgs.msg import Localizations, Pose6DOF
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.frame import NAN, Frame
 from mems6dof_ros.nodes import transport
@@ -185,6 +184,13 @@ PARAMETERS = (
     *camera_parameters(),
 )
 
+#: What is published.
+_TYPES = {
+    topics.IMAGE: "sensor_msgs/msg/Image",
+    topics.FRAME_INFO: "mems6dof_msgs/msg/FrameInfo",
+    topics.CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
+    topics.TRUTH: "mems6dof_msgs/msg/GroundTruth",
+}
 _READERS_PATIENCE = 1.0  # s; longer than a loaded host takes to hand over a few frames
 _LONGEST_READ = 30.0  # s; a simulator renders a full frame in much less, a device answers within 1 s
 
@@ -231,12 +237,11 @@ class FrameSourceNode(InstrumentNode):
         self._steps = 0
         self._playing = False  # the source has been started and has not ended
         self._held: Frame | None = None  # read, but not yet published
-        self._topics: dict[str, Publisher] = {
-            topics.IMAGE: self.create_publisher(Image, topics.IMAGE, transport.FRAMES),
-            topics.FRAME_INFO: self.create_publisher(FrameInfo, topics.FRAME_INFO, transport.MESSAGES),
-            topics.CAMERA_INFO: self.create_publisher(CameraInfo, topics.CAMERA_INFO, transport.MESSAGES),
-            topics.TRUTH: self.create_publisher(GroundTruth, topics.TRUTH, transport.MESSAGES),
-        }
+        self._topics: dict[str, Publisher] = {}
+        for topic, kind in _TYPES.items():
+            quality = transport.FRAMES if topic == topics.IMAGE else transport.MESSAGES
+            self._topics[topic] = self.create_publisher(messages.rclpy_type(kind), topic, quality)
+        messages.prepare(*_TYPES.values())
         self._ring = self._make_ring() if self.values.get("share_frames") else None
         wanted = self.values["publish_clock"]
         self._clocks = self.create_publisher(Clock, "/clock", transport.MESSAGES) if wanted else None
@@ -374,7 +379,7 @@ class FrameSourceNode(InstrumentNode):
         """Publish; ``published_ns``: when it was made known already, host clock."""
         # Messages are made only for somebody, and most of them before the clock of the latency runs.
         made = [
-            (self._topics[topic], messages.to_rclpy(message))
+            (self._topics[topic], bytes(messages.serialize(message)))
             for topic, several in (
                 (topics.TRUTH, messages.ground_truths),
                 (topics.CAMERA_INFO, lambda frame: [messages.camera_info(frame)]),
@@ -386,7 +391,7 @@ class FrameSourceNode(InstrumentNode):
         frame = replace(frame, published_ns=published_ns or time.time_ns())
         if self._ring and self._ring.wanted:
             self._ring.write(frame)
-        self._topics[topics.FRAME_INFO].publish(messages.to_rclpy(messages.frame_info(frame)))
+        transport.publish(self._topics[topics.FRAME_INFO], messages.frame_info(frame))
         for publisher, message in made:
             publisher.publish(message)
             self._sent_images += publisher is self._topics[topics.IMAGE]

@@ -20,7 +20,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
 from mems6dof_msgs.msg import FrameInfo, Pose6DOF
@@ -141,7 +140,7 @@ class LocalizationOutput:
 
     def publish(self, found: Localizations) -> None:
         """Publish, and keep account of it."""
-        self.publisher.publish(messages.to_rclpy(messages.localizations(found)))
+        transport.publish(self.publisher, messages.localizations(found))
         if self._points.get_subscription_count():
             self._points.publish(point_cloud(found))
         health = self._node.health
@@ -178,7 +177,7 @@ class LocalizerNode(InstrumentNode):
 
     def _rehearse(self) -> None:
         rehearse(self._output.localizer)
-        messages.deserialize(serialize_message(Image()), "sensor_msgs/msg/Image")  # the first takes 0.1 s
+        messages.prepare("sensor_msgs/msg/Image", "mems6dof_msgs/msg/Localizations")
 
     def _subscribe(self) -> None:
         stream = self.make_stream(self._on_tick)

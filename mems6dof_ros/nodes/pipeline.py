@@ -19,7 +19,7 @@ from mems6dof_ros.localization.localizations import Latency
 from mems6dof_ros.nodes import frame_source, localizer, pose_estimator
 from mems6dof_ros.nodes.common import QUEUE_PARAMETERS, WAIT_PARAMETER, run
 from mems6dof_ros.nodes.parameters import Parameter
-from mems6dof_ros.recording import topics
+from mems6dof_ros.recording import messages, topics
 
 
 def _parameters() -> tuple[Parameter, ...]:
@@ -63,6 +63,7 @@ class PipelineNode(frame_source.FrameSourceNode):
         self.when_ready(self.missing_subscribers(publishers), self._thread.start, self._rehearse)
 
     def _rehearse(self) -> None:
+        messages.prepare("mems6dof_msgs/msg/Localizations")
         localizer.rehearse(self._localization.localizer)
         pose_estimator.rehearse(self._pose.settings)
 

@@ -140,7 +140,7 @@ class PoseOutput:
         )
         poses = [replace(self._as_counted(pose, found.cycle), latency=latency) for pose in poses]
         for topic, message in pose_messages(poses):
-            self.publishers[topic].publish(messages.to_rclpy(message))
+            transport.publish(self.publishers[topic], message)
         with self._using_bodies:
             self._bodies.learn()  # what takes milliseconds now and then, when the poses are out
         self._report(poses)
@@ -286,10 +286,11 @@ class PoseEstimatorNode(InstrumentNode):
 
 
 def rehearse(settings: PoseSettings) -> None:
-    """Follow a gear that nobody sees: from cycle to cycle, and once lost and found."""
+    """Follow a gear that nobody sees, and tell of it: from cycle to cycle, and once lost and found."""
     gear, estimator = SyntheticGear(Scene(particles=40), seed=0), PoseEstimator(settings)
     for step in (0.1, 0.1, 1.0, 0.1):
-        estimator.update(gear.observe()[0])
+        for _, message in pose_messages([estimator.update(gear.observe()[0])]):
+            messages.serialize(message)
         gear.advance(step)
 
 

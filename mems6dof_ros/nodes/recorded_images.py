@@ -6,14 +6,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from mems6dof_ros.errors import InputError
-from mems6dof_ros.frame import Frame
 from mems6dof_ros.nodes import transport
 from mems6dof_ros.nodes.common import InstrumentNode
 from mems6dof_ros.nodes.image_route import ImageRoute
 from mems6dof_ros.recording import messages
+
+_INFO = "mems6dof_msgs/msg/FrameInfo"
 
 #: Calls with a serialized message and rclpy's dict about it.
 Record = Callable[[bytes | memoryview, dict[str, Any]], None]
@@ -30,7 +29,7 @@ class RecordedImages:
         record: Record,
         lost: Callable[[int, str], None],
     ) -> None:
-        _rehearse()
+        messages.prepare(_INFO, "sensor_msgs/msg/Image")  # else images are lost meanwhile
         self._route = ImageRoute(node, subscribe, unsubscribe, acknowledging=True)
         self._record, self._lost = record, lost
         # Stamps of what came by the topic and out of memory, and may come the other way too.
@@ -42,7 +41,7 @@ class RecordedImages:
     def on_info(self, data: bytes, about: dict[str, Any]) -> None:
         """A serialized frame_info has come, and with it perhaps its image in memory."""
         try:
-            info = messages.deserialize(data, "mems6dof_msgs/msg/FrameInfo")
+            info = messages.deserialize(data, _INFO)
             stamp_ns = messages.nanoseconds(info.header.stamp)
         except Exception:  # whatever a reader of nonsense stumbles over: it tells of no image
             return
@@ -76,11 +75,3 @@ class RecordedImages:
             return
         self._by_topic.append(stamp_ns)
         self._record(data, about)
-
-
-def _rehearse() -> None:
-    """The first of each message takes 0.1 s, in which images are lost."""
-    frame = Frame(np.zeros((1, 1), np.uint16), stamp_ns=0, frame_counter=0, cycle=0)
-    messages.serialize(messages.image(frame))
-    info = messages.frame_info(frame)
-    messages.deserialize(messages.serialize(info), info.type)

@@ -79,13 +79,13 @@ class SyntheticGearNode(InstrumentNode):
         every = self.values["image_every"]
         with_image = every > 0 and self._number % every == 0
         frame, found, pose = self._machine.cycle(self._number, image=with_image)
-        self._info.publish(messages.to_rclpy(messages.frame_info(frame)))
+        transport.publish(self._info, messages.frame_info(frame))
         if with_image:
-            self._image.publish(messages.to_rclpy(messages.image(frame)))
+            transport.publish(self._image, messages.image(frame))
         for truth in messages.ground_truths(frame):
-            self._truth.publish(messages.to_rclpy(truth))
-        self._found.publish(messages.to_rclpy(messages.localizations(found)))
-        self._pose.publish(messages.to_rclpy(messages.pose6dof(pose)))
+            transport.publish(self._truth, truth)
+        transport.publish(self._found, messages.localizations(found))
+        transport.publish(self._pose, messages.pose6dof(pose))
         self._number += 1
 
 

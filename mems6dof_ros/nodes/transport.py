@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from mems6dof_ros.errors import InputError, Mems6dofError
 from mems6dof_ros.nodes import shared_memory
+from mems6dof_ros.recording.messages import Message, serialize
 
 _SHARED_MEMORY = shared_memory.FOLDER
 _MEBIBYTE = 2**20
@@ -90,6 +92,12 @@ def _free_shared_memory(otherwise: int) -> int:
     if not _SHARED_MEMORY.is_dir():
         return otherwise
     return shutil.disk_usage(_SHARED_MEMORY).free // _MEBIBYTE
+
+
+def publish(publisher: Publisher, message: Message) -> None:
+    """Publish ``message`` serialized: rclpy's own way checks and converts it field by field, three times
+    slower."""
+    publisher.publish(bytes(serialize(message)))
 
 
 def stamp_of(data: bytes) -> int:

@@ -91,6 +91,29 @@ def log_so3(rotation: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def quaternion(rotation: Array) -> Array:
+    """Unit quaternion x, y, z, w of ``rotation`` (3, 3), w not negative (Shepperd 1978: by its largest
+    component, so that nothing cancels). NaN stays NaN."""
+    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    squares = np.array([rotation[0, 0], rotation[1, 1], rotation[2, 2], trace])
+    largest = int(np.argmax(squares))
+    q = np.empty(4)
+    if largest == 3:
+        q[0] = rotation[2, 1] - rotation[1, 2]
+        q[1] = rotation[0, 2] - rotation[2, 0]
+        q[2] = rotation[1, 0] - rotation[0, 1]
+        q[3] = 1 + trace
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q[i] = 1 + 2 * rotation[i, i] - trace
+        q[j] = rotation[j, i] + rotation[i, j]
+        q[k] = rotation[k, i] + rotation[i, k]
+        q[3] = rotation[k, j] - rotation[j, k]
+    q /= math.sqrt(float(q @ q))
+    return -q if q[3] < 0 else q
+
+
+@njit(cache=True, nogil=True)
 def left_jacobian(w: Array) -> Array:
     """J (3, 3) of ``Exp(w + d) = Exp(J d) Exp(w)`` to first order (Sola et al. 2018, eq. 145)."""
     angle = math.sqrt(float(w @ w))

@@ -25,6 +25,7 @@ from mems6dof_ros.errors import InputError
 from mems6dof_ros.frame import NAN, Frame, GroundTruth
 from mems6dof_ros.localization.localizations import FIT_PARAMETERS, Flag, GaussianFits, Latency, Localizations
 from mems6dof_ros.pose.cycle_pose import DEGREES_OF_FREEDOM, CyclePose, PaperAngles, Status
+from mems6dof_ros.pose.rigid import quaternion
 from mems6dof_ros.recording.definitions import typestore
 
 #: Pixel types that can be measured, by ROS image encoding.
@@ -76,6 +77,12 @@ def to_rosbags(message: Message) -> Any:
         for field, value in message.fields.items()
     }
     return typestore().types[message.type](**values)
+
+
+def prepare(*typenames: str) -> None:
+    """Make what reads and writes messages of these types, 0.2 s for the first, before one is in a hurry."""
+    for typename in typenames:
+        typestore().get_msgdef(typename)
 
 
 def serialize(message: Message) -> memoryview:
@@ -215,7 +222,13 @@ def pose6dof(cycle_pose: CyclePose) -> Message:
             "status": int(cycle_pose.status),
             "reason": cycle_pose.reason,
             "reference_version": cycle_pose.reference_version,
-            "pose": _pose_with_covariance(cycle_pose),
+            "pose": Message(
+                "geometry_msgs/msg/PoseWithCovariance",
+                {
+                    "pose": pose(cycle_pose.rotation, cycle_pose.translation),
+                    "covariance": _flat(cycle_pose.covariance),
+                },
+            ),
             **dict(zip(DEGREES_OF_FREEDOM, map(float, cycle_pose.displacement), strict=True)),
             "displacement_covariance": _flat(cycle_pose.displacement_covariance),
             "alpha": float(angles.alpha),
@@ -245,26 +258,16 @@ def pose6dof(cycle_pose: CyclePose) -> Message:
     )
 
 
-def pose_stamped(cycle_pose: CyclePose) -> Message:
-    """geometry_msgs/PoseStamped: the pose of the body in the microscope frame."""
-    return Message(
-        "geometry_msgs/msg/PoseStamped",
-        {
-            "header": header(cycle_pose.stamp_ns, cycle_pose.frame_id),
-            "pose": pose(cycle_pose.rotation, cycle_pose.translation),
-        },
-    )
+def pose_stamped(of: Message) -> Message:
+    """geometry_msgs/PoseStamped: the pose of the body in the microscope frame, of a ``pose6dof``."""
+    pose = of.fields["pose"].fields["pose"]
+    return Message("geometry_msgs/msg/PoseStamped", {"header": of.fields["header"], "pose": pose})
 
 
-def pose_with_covariance_stamped(cycle_pose: CyclePose) -> Message:
+def pose_with_covariance_stamped(of: Message) -> Message:
     """geometry_msgs/PoseWithCovarianceStamped: likewise, with its covariance."""
-    return Message(
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        {
-            "header": header(cycle_pose.stamp_ns, cycle_pose.frame_id),
-            "pose": _pose_with_covariance(cycle_pose),
-        },
-    )
+    stamped = {"header": of.fields["header"], "pose": of.fields["pose"]}
+    return Message("geometry_msgs/msg/PoseWithCovarianceStamped", stamped)
 
 
 def header(stamp_ns: int, frame_id: str) -> Message:
@@ -280,25 +283,13 @@ def time(nanoseconds: int) -> Message:
 
 def pose(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Message:
     """geometry_msgs/Pose of a (3, 3) rotation and a (3,) translation in m; NaN stays NaN."""
-    known = np.isfinite(rotation).all()
-    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True) if known else np.full(4, NAN)
-    point = dict(zip("xyz", map(float, translation), strict=True))
-    orientation = dict(zip("xyzw", map(float, quaternion), strict=True))
+    point = dict(zip("xyz", translation.tolist(), strict=True))
+    orientation = dict(zip("xyzw", quaternion(rotation).tolist(), strict=True))
     return Message(
         "geometry_msgs/msg/Pose",
         {
             "position": Message("geometry_msgs/msg/Point", point),
             "orientation": Message("geometry_msgs/msg/Quaternion", orientation),
-        },
-    )
-
-
-def _pose_with_covariance(cycle_pose: CyclePose) -> Message:
-    return Message(
-        "geometry_msgs/msg/PoseWithCovariance",
-        {
-            "pose": pose(cycle_pose.rotation, cycle_pose.translation),
-            "covariance": _flat(cycle_pose.covariance),
         },
     )
 
@@ -468,7 +459,7 @@ def _square(values: Any) -> NDArray[np.float64]:
 
 def _matrix(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     p, q = message.position, message.orientation
-    quaternion = np.array([q.x, q.y, q.z, q.w])
-    known = np.isfinite(quaternion).all() and quaternion.any()
-    rotation = Rotation.from_quat(quaternion).as_matrix() if known else np.full((3, 3), NAN)
+    turn = np.array([q.x, q.y, q.z, q.w])
+    known = np.isfinite(turn).all() and turn.any()
+    rotation = Rotation.from_quat(turn).as_matrix() if known else np.full((3, 3), NAN)
     return rotation, np.array([p.x, p.y, p.z])

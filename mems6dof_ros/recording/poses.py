@@ -35,14 +35,15 @@ def pose_messages(poses: Sequence[CyclePose]) -> Iterator[tuple[str, Message]]:
     valid, ``pose_6dof`` alone says so."""
     for number, pose in enumerate(poses):
         prefix = "" if number == 0 else topics.of_body(pose.body, "")
-        yield prefix + topics.POSE_6DOF, messages.pose6dof(pose)
+        message = messages.pose6dof(pose)
+        yield prefix + topics.POSE_6DOF, message
         if not pose.valid:
             continue
-        yield prefix + topics.POSE, messages.pose_stamped(pose)
-        yield prefix + topics.POSE_WITH_COVARIANCE, messages.pose_with_covariance_stamped(pose)
+        yield prefix + topics.POSE, messages.pose_stamped(message)
+        yield prefix + topics.POSE_WITH_COVARIANCE, messages.pose_with_covariance_stamped(message)
         if number > 0 and poses[0].valid:
-            relative = messages.pose_with_covariance_stamped(_relative(pose, poses[0]))
-            yield prefix + topics.RELATIVE_POSE, relative
+            relative = messages.pose6dof(_relative(pose, poses[0]))
+            yield prefix + topics.RELATIVE_POSE, messages.pose_with_covariance_stamped(relative)
 
 
 def _relative(of: CyclePose, to: CyclePose) -> CyclePose:

@@ -14,6 +14,7 @@ from mems6dof_ros.pose.rigid import (
     kabsch,
     left_jacobian,
     log_so3,
+    quaternion,
     rotation_z,
     shift_origin,
 )
@@ -27,6 +28,23 @@ def test_exponential_and_logarithm_agree_with_scipy(angle):
     # At a half turn the axis has no sign.
     assert np.allclose(exp_so3(log_so3(rotation)), rotation, atol=1e-7)
     assert np.linalg.norm(log_so3(rotation)) == pytest.approx(angle, abs=1e-7)
+
+
+def test_the_quaternion_is_that_of_scipy():
+    """Of turns about every axis, also by half a turn, where three of its components may vanish."""
+    rotations = [*Rotation.random(100, rng=1), *(Rotation.from_rotvec(math.pi * e) for e in np.eye(3))]
+    rotations += [
+        Rotation.identity(),
+        Rotation.from_rotvec([0, 0, 1e-9]),
+        Rotation.from_rotvec([0, 2.1, 2.1]),
+    ]
+    for rotation in rotations:
+        found = quaternion(rotation.as_matrix())
+        assert found[3] >= 0
+        expected = rotation.as_quat(canonical=True)
+        sign = 1.0 if found @ expected > 0 else -1.0  # of half a turn either is right
+        assert np.allclose(sign * found, expected, atol=1e-15)
+    assert np.isnan(quaternion(np.full((3, 3), np.nan))).all()
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-5, 0.3, 2.0])

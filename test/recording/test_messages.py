@@ -69,8 +69,8 @@ def test_pose(transport, status, make):
 def test_the_three_pose_messages_agree(transport, make):
     cycle_pose = make.pose()
     full = transport(messages.pose6dof(cycle_pose))
-    with_covariance = transport(messages.pose_with_covariance_stamped(cycle_pose))
-    plain = transport(messages.pose_stamped(cycle_pose))
+    with_covariance = transport(messages.pose_with_covariance_stamped(messages.pose6dof(cycle_pose)))
+    plain = transport(messages.pose_stamped(messages.pose6dof(cycle_pose)))
     assert full.header == with_covariance.header == plain.header
     assert str(full.pose) == str(with_covariance.pose)
     assert str(full.pose.pose) == str(plain.pose)

@@ -54,6 +54,7 @@ WAIT_PARAMETER = Parameter(
 #: Fraction of a queue from which it is a concern.
 _FULL = 0.8
 #: Seconds of waiting for others after which it is a concern.
+_LOOK = 0.25  # s, how often a node looks whether it is to end: each time costs rclpy some ms
 _PATIENCE = 10.0
 
 
@@ -302,7 +303,7 @@ def _spin(node: InstrumentNode, stop: threading.Event) -> None:
 
     try:
         while rclpy.ok() and not stop.is_set() and not node.finished.is_set():
-            executor.spin_once(timeout_sec=0.1)
+            executor.spin_once(timeout_sec=_LOOK)
             # CPython may overlook a signal that comes while threads hand over the interpreter.
             ctypes.pythonapi.PyErr_CheckSignals()
             node.check()

@@ -20,7 +20,7 @@ from mems6dof_ros.sources.bag import BagSource
 
 def workers(material: Material) -> list[Row]:
     """Wall time: only meaningful where two cores are free."""
-    count = 40 if material.quick else 240  # to open it takes as long as ten
+    count = 40 if material.quick else 600  # to open it takes as long as eight
     bag = material.directory / "bag"
     frames = [frame for frame, _ in zip(loop(material.frames), range(count), strict=False)]
     write_bag(bag, frames, material.calibration.camera, {}, lambda done: None)

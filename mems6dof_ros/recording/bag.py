@@ -19,12 +19,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NamedTuple, cast
 
-import yaml
 from mcap.reader import McapReader, make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from mems6dof_ros import __version__
+from mems6dof_ros.documents import from_yaml, to_yaml
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording import read_ahead
 from mems6dof_ros.recording.definitions import PACKAGE, definition, named_types, typestore
@@ -295,7 +295,7 @@ class _File:
         if channel.type not in self._schemas:
             schema = described.schema.encode()
             self._schemas[channel.type] = self._writer.register_schema(channel.type, "ros2msg", schema)
-        profiles = yaml.safe_dump([qos.profile() for qos in channel.qos], sort_keys=False)
+        profiles = to_yaml([qos.profile() for qos in channel.qos])
         metadata = {"offered_qos_profiles": profiles, "topic_type_hash": described.type_hash}
         schema_id = self._schemas[channel.type]
         self._ids[channel] = self._writer.register_channel(channel.topic, "cdr", schema_id, metadata)
@@ -392,7 +392,7 @@ class BagReader:
         if not self.path.is_dir():
             return []
         text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
-        listed = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        listed = from_yaml(text)["rosbag2_bagfile_information"]["relative_file_paths"]
         return [file.name for file in mcap_files(self.path) if file.name not in map(os.path.basename, listed)]
 
     def messages(self, topics: Iterable[str] | None = None, threads: int = 1) -> Iterator[Recorded]:
@@ -426,7 +426,7 @@ class BagReader:
         if not self.path.is_dir():
             return []
         text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
-        listed = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        listed = from_yaml(text)["rosbag2_bagfile_information"]["relative_file_paths"]
         files = [self.path / name for name in listed]
         return files if all(file.suffix == ".mcap" for file in files) else []
 

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from mems6dof_ros.documents import from_yaml, to_yaml
+
 VERSION = 9  # of rosbag2 in Jazzy; Humble reads up to 8 but takes the MCAP file alone
 #: Name of the MCAP metadata record with our provenance.
 PROVENANCE = "mems6dof"
@@ -80,7 +82,7 @@ def read_custom(folder: Path) -> dict[str, str]:
     """The ``custom`` data of ``metadata.yaml``; empty where there is none that can be read."""
     try:
         text = (folder / "metadata.yaml").read_text(encoding="utf-8")
-        return dict(yaml.safe_load(text)["rosbag2_bagfile_information"]["custom_data"])
+        return dict(from_yaml(text)["rosbag2_bagfile_information"]["custom_data"])
     except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, KeyError, ValueError):
         return {}
 
@@ -117,7 +119,7 @@ def metadata_text(files: Sequence[FileSummary], custom: Mapping[str, str]) -> st
         "custom_data": dict(custom),
         "ros_distro": "jazzy",
     }
-    return yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+    return to_yaml({"rosbag2_bagfile_information": information})
 
 
 def _span(files: Sequence[FileSummary]) -> dict[str, Any]:

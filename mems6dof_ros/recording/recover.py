@@ -26,6 +26,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
+from mems6dof_ros.documents import from_yaml
 from mems6dof_ros.errors import InputError
 from mems6dof_ros.recording.metadata import PROVENANCE, Channel, FileSummary, Qos, write_metadata
 
@@ -384,6 +385,6 @@ def _summary(path: Path, contents: _Contents) -> FileSummary:
 def _qos(text: str) -> tuple[Qos, ...]:
     """Profiles as other writers put them, too; none where they cannot be read."""
     try:
-        return tuple(Qos.from_profile(profile) for profile in yaml.safe_load(text) or ())
+        return tuple(Qos.from_profile(profile) for profile in from_yaml(text) or ())
     except (yaml.YAMLError, TypeError, KeyError, ValueError):
         return ()

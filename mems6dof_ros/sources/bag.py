@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,8 @@ class BagSource:
 
     def __init__(self, path: str | Path, *, topic: str = "") -> None:
         self._path = Path(path)
-        with BagReader(self._path) as bag:
+        with contextlib.ExitStack() as opened:
+            bag = opened.enter_context(BagReader(self._path))
             self._topic = topic or _only_image_topic(bag)
             if bag.topics.get(self._topic) != IMAGE:
                 raise InputError(str(path), f"no images on topic '{self._topic}'", _choices(bag))
@@ -48,8 +50,10 @@ class BagSource:
             self._iterator, self._read = self._parts(bag), 0
             first = self.read()
             self.stop()
-        if first is None:
-            raise InputError(str(path), f"no message on '{self._topic}'", "at least one image")
+            if first is None:
+                raise InputError(str(path), f"no message on '{self._topic}'", "at least one image")
+            opened.pop_all()
+        self._bag: BagReader | None = bag  # open, for the next who reads: to open one takes 0.1 s
         height, width = first.image.shape
         camera = camera_from_json(stated) if stated else None
         self._info = SourceInfo("bag", width, height, first.encoding, first.pixel_size, self._count, camera)
@@ -76,7 +80,8 @@ class BagSource:
         self._iterator = iter(())
 
     def _opened(self) -> Iterator[dict[str, Any]]:
-        with BagReader(self._path) as bag:
+        bag, self._bag = self._bag, None
+        with bag or BagReader(self._path) as bag:
             yield from self._parts(bag)
 
     def _parts(self, bag: BagReader) -> Iterator[dict[str, Any]]:

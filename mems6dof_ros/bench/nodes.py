@@ -105,7 +105,7 @@ def recorder(material: Material) -> list[Row]:
     """What a recorder beside the chain takes of its rate, and whether it writes all frames too.
 
     At the drive's rate, or nine tenths of what the chain can do: beyond it whatever runs takes its share.
-    Frames at that rate too, or at the disk's.
+    Frames at that rate too, or at the disk's, tracking as it does when live.
     """
     free = _chain(material, 0.0)
     rate = min(DRIVE, 0.9 * free.rate)
@@ -116,7 +116,7 @@ def recorder(material: Material) -> list[Row]:
     size = 2e-6 * material.size**2
     disk = _disk_rate(material.directory)
     with_frames = min(rate, DISK_SHARE * disk / size)
-    frames = _chain(material, with_frames, output=output, images=True)
+    frames = _chain(material, with_frames, tracking=True, output=output, images=True)
     gaps = _missing(output, topics.IMAGE)
     missing = _missing(material.directory / "recorded", topics.POSE_6DOF)
     return [
@@ -126,7 +126,7 @@ def recorder(material: Material) -> list[Row]:
             details={"missing in the bag": missing, **beside.details}),
         Row("recorder beside, at the highest rate", beside_free.rate, "/s", "without", free.rate,
             beside_free.rate / free.rate, details=beside_free.details),
-        Row(f"recorder beside, at {with_frames:.0f}/s: frames too", frames.rate * size, "MB/s",
+        Row(f"recorder beside, tracking, at {with_frames:.0f}/s: frames too", frames.rate * size, "MB/s",
             "the disk, sequential", disk, frames.rate / with_frames if not frames.lost + gaps else 0.0, 0.97,
             note="figure: rate over what was asked for; 0 where a frame was lost, or is missing in the bag",
             details={"missing in the bag": gaps, **frames.details}),

@@ -80,6 +80,7 @@ _RATE_OVER = 30  # s over which the rate of the record is taken
 _WARN_BEFORE = 30.0  # min until the disk is full
 _QUIET = 0.1  # s without a message after which nothing is expected any more
 _LATCHED = 10  # messages of a transient-local topic that stand at the beginning of every file
+_NICE = 5  # of the thread that writes
 _MEBIBYTE = 2**20
 
 PARAMETERS = (
@@ -170,7 +171,7 @@ class RecorderNode(InstrumentNode):
             self._open()
         self._dropped = 0
         capacity = self.values["queue_mebibytes"] * _MEBIBYTE
-        self.start_worker(lambda act: act(), capacity)
+        self.start_worker(lambda act: act(), capacity).put(_step_back, 0)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._channels: list[Channel] = []
         self._images: RecordedImages | None = None  # of the topic that may be left for shared memory
@@ -508,6 +509,12 @@ class RecorderNode(InstrumentNode):
 
         timer = self.create_timer(_QUIET, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
         return quiet
+
+
+def _step_back() -> None:
+    """Let this thread yield to the measurement, where processors are short: it has a queue."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
 
 
 def _attach(bag: BagWriter, name: str, text: str) -> None:

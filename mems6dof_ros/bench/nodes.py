@@ -71,6 +71,7 @@ def four_processes(material: Material) -> list[Row]:
     rate = min(DRIVE, 0.9 * chain.rate)
     paced_bare, paced = _bare(material, rate), _chain(material, rate)
     tracked = _chain(material, rate, tracking=True)
+    tracked_free = _chain(material, 0.0, tracking=True)
     by_topic = _chain(material, 0.0, shared=False)
     # Eight tenths of the bare rate; where that has more than the drive needs, all that the drive needs.
     least = 0.8 if bare.rate < DRIVE else 1.0
@@ -80,6 +81,8 @@ def four_processes(material: Material) -> list[Row]:
             min(chain.rate, DRIVE) / min(bare.rate, DRIVE) if not chain.lost else 0.0, least,
             note="figure: both limited to 90/s; 0 where a frame was lost",
             details={"of the bare rate": chain.rate / bare.rate, **chain.details}),
+        Row("... tracking", tracked_free.rate, "/s", "the same subscriber", bare.rate,
+            tracked_free.rate / bare.rate, details=tracked_free.details),
         Row("... frames by the topic, not by shared memory", by_topic.rate, "/s", "the same subscriber",
             bare.rate, details=by_topic.details),
         *_latencies(f"{paced_name}, tracking", tracked, paced_bare, 8.0, 11.0),

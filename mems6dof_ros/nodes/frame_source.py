@@ -123,7 +123,8 @@ PARAMETERS = (
     Parameter(
         "share_frames",
         True,
-        "Frames also go by memory that is shared with a localizer on this host, which then leaves the topic.",
+        "Frames also go by memory that is shared with a localizer or recorder on this host, which then leaves"
+        " the topic.",
     ),
     START_PAUSED,
     Parameter(

@@ -1,9 +1,10 @@
 """Frames in memory that processes of one host share, beside the topic of images.
 
-By a topic, a 2048 x 2048 frame is copied several times between source and localizer and costs both together
-6 ms; into a ring in /dev/shm it is copied once. The ``frame_info`` of a frame says that it is there. The ring
-is named after this topic, so source and localizer find each other without being told; where they do
-not, on another host, without room in /dev/shm or for another user, the topic of images serves as ever.
+By a topic, a 2048 x 2048 frame is copied several times between source and reader (a localizer, a recorder)
+and costs both together 6 ms; into a ring in /dev/shm it is copied once. The ``frame_info`` of a frame says
+that it is there. The ring is named after this topic, so source and reader find each other without being told;
+where they do not, on another host, without room in /dev/shm or for another user, the topic of images serves
+as ever.
 
 A file is a header, then slots of a header and the pixels each. The writer goes round and waits for nobody: a
 reader uses a frame where it lies and asks afterwards whether it was ``intact`` until then.

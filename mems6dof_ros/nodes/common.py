@@ -54,8 +54,9 @@ WAIT_PARAMETER = Parameter(
 #: Fraction of a queue from which it is a concern.
 _FULL = 0.8
 #: Seconds of waiting for others after which it is a concern.
-_LOOK = 0.25  # s, how often a node looks whether it is to end: each time costs rclpy some ms
 _PATIENCE = 10.0
+#: Seconds between looks whether the node is to end: each costs rclpy some milliseconds.
+_LOOK = 0.25
 
 
 class InstrumentNode(ManagedNode):

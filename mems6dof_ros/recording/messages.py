@@ -1,8 +1,8 @@
 """Messages to and from the core types, in both worlds: ``rclpy`` and ``rosbags``.
 
 A core type becomes a neutral ``Message`` (type name and fields), and one small builder per world
-turns that into what is published (``to_rclpy``) or written (``to_rosbags``). Messages of both worlds
-are read by attribute, so one function per type reads either.
+turns that into an instance there (``to_rclpy``, ``to_rosbags``); ``serialize`` into what is published and
+written. Messages of both worlds are read by attribute, so one function per type reads either.
 
 Not carried by the messages, hence lost on the way back: the iterations and the 7 x 7 covariance
 of a fit, of which the 3 x 3 covariance of the position is the useful part.

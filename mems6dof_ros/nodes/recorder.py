@@ -63,7 +63,7 @@ KNOWN_TYPES = {
     topics.CONTROLLER_STATE: "mems6dof_msgs/msg/ControllerState",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
-#: Recorded unless asked otherwise: everything but the images, which need the disk's own rate.
+#: Recorded unless asked otherwise: everything but the images, at full field a gigabyte in 1.3 s.
 DEFAULT_TOPICS = tuple(name for name in KNOWN_TYPES if name != topics.IMAGE)
 
 #: More than their publisher keeps: what it takes for acknowledged waits here until it is taken.

@@ -80,7 +80,7 @@ _RATE_OVER = 30  # s over which the rate of the record is taken
 _WARN_BEFORE = 30.0  # min until the disk is full
 _QUIET = 0.1  # s without a message after which nothing is expected any more
 _LATCHED = 10  # messages of a transient-local topic that stand at the beginning of every file
-_NICE = 5  # of the thread that writes
+_NICE = 5  # of the thread that writes, or of a session of its own
 _MEBIBYTE = 2**20
 
 PARAMETERS = (
@@ -512,9 +512,14 @@ class RecorderNode(InstrumentNode):
 
 
 def _step_back() -> None:
-    """Let this thread yield to the measurement, where processors are short: it has a queue."""
+    """Let this thread yield to the measurement, where processors are short: it has a queue.
+
+    Linux may first share processors among sessions (autogroups), of which the runner gives every node one.
+    """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        if os.getsid(0) == os.getpid():
+            Path("/proc/self/autogroup").write_text(str(_NICE), encoding="ascii")
 
 
 def _attach(bag: BagWriter, name: str, text: str) -> None:

@@ -32,8 +32,11 @@ class RecordedImages:
         messages.prepare(_INFO, "sensor_msgs/msg/Image")  # else images are lost meanwhile
         self._route = ImageRoute(node, subscribe, unsubscribe, acknowledging=True)
         self._record, self._lost = record, lost
-        # Stamps of what came by the topic and out of memory, and may come the other way too.
+        # Stamps of what came by the topic before its info; of what infos told that is to come by the topic;
+        # and of what came out of memory and may come by the topic too. Recordings repeat their stamps, so
+        # none stays when both have come.
         self._by_topic: deque[int] = deque(maxlen=64)
+        self._awaited: deque[int] = deque(maxlen=64)
         self._from_memory: deque[int] = deque(maxlen=64)
         self.tick = self._route.tick
         node.health.gauge("images by", lambda: self._route.way)
@@ -57,6 +60,8 @@ class RecordedImages:
                 self._miss(info.frame_counter)
         elif self._route.overtaken(stamp_ns):
             self._miss(info.frame_counter)
+        else:
+            self._awaited.append(stamp_ns)
         self._route.choose(stamp_ns, shared is not None)
         if not self._route.by_topic:
             self._from_memory.clear()
@@ -73,5 +78,8 @@ class RecordedImages:
         if stamp_ns in self._from_memory:
             self._from_memory.remove(stamp_ns)
             return
-        self._by_topic.append(stamp_ns)
+        if stamp_ns in self._awaited:
+            self._awaited.remove(stamp_ns)
+        else:
+            self._by_topic.append(stamp_ns)
         self._record(data, about)
